@@ -59,7 +59,7 @@ def _printer(hosts: Sequence[Host], plan: Plan) -> tuple[list[str], Printer]:
             shown = partial(format_hosts, sort_by=plan.options["sort_by"])
             table = TablePrinter(hosts, row_of, shown, nothing)
             return with_output(plan.words, "json"), table
-    if plan.verb == "releases" and not plan.wants_json:
+    if plan.verb == "releases" and not (plan.wants_json or plan.options["want_history"]):
         releases = TablePrinter(hosts, cells_of, format_releases, "No release.")
         return with_output(plan.words, "json"), releases
     if plan.has_lines and not plan.options.get("dry_run"):

@@ -8,6 +8,7 @@ from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches
+from dora_systemd.decisions.releases.past import Switch, completed, undone
 from dora_systemd.decisions.views.dataflows import DEGRADED, FAILED
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
@@ -16,7 +17,7 @@ from dora_systemd.decisions.why.postmortem import examine
 from dora_systemd.decisions.why.report import LINES, Report, Subject
 from dora_systemd.decisions.why.verdict import Facts, Verdict
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import unit_name
+from dora_systemd.names import release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
@@ -51,7 +52,19 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     inhibitors = read_holders(scope, [cell.name]).get(cell.name, ()) if cell else ()
     is_held = cell is not None and _is_held(scope, cell, verdict.node)
     machines = _machines(manager, cell) if cell and cell.options.placed else {}
-    return Report(subject, verdict, words, budget, inhibitors, is_held, machines)
+    last = _undone(scope, subject)
+    return Report(subject, verdict, words, budget, inhibitors, is_held, machines, last)
+
+
+def _undone(scope: Scope, subject: Subject) -> Switch | None:
+    """How the last release ended, if nothing newer runs in its place; None if it is not known."""
+    # Imported late: few dataflows have releases.
+    from dora_systemd.verbs.releases.listing import store_of
+
+    with suppress(DoraSystemdError):  # only its owner may read it
+        store = store_of(scope, subject.name)
+        return undone(completed(store.history(), release_of(subject.file)))
+    return None
 
 
 def newest_failure(manager: Manager, scope: Scope) -> str:

@@ -54,7 +54,7 @@ def test_a_release_runs_and_is_not_what_it_was_copied_from(
     # And back again.
     cell.doractl("rollback", cell.name)
     assert (releases.current(), releases.running()) == (first, first)
-    assert sorted(releases.states().values()) == ["current", "proved"]
+    assert list(releases.states().values()) == ["rolled-back", "current"]
     assert f"Release:  {first}" in cell.doractl("list", cell.name).stdout
     changed = cell.doractl("deploy", str(flow), "--name", cell.name, "--dry-run").stdout
     assert changed == "~ a.py\n", "it differs from what runs, and not from the newest one"
@@ -68,7 +68,7 @@ def test_a_first_version_that_is_bad_leaves_nothing_running(
     said = releases.deploy(project.root, status=11)
     assert "node a: exit code 3" in said
     assert "nothing of it runs" in said
-    assert (releases.running(), list(releases.states().values())) == ("", ["unproved"])
+    assert (releases.running(), list(releases.states().values())) == ("", ["failed"])
     assert not (ETC / releases.cell.unit).exists()
     assert not releases.trial.exists()
 

@@ -90,8 +90,9 @@ def test_roll_back(browser: Browser, releases: Releases, project: Project, flag:
     confirm(browser, first)
     browser.wait_text("#said", f"runs release {first}", 60)
     browser.wait_text(f"{row(first)} .badge", "Current")
-    browser.wait_text(f"{row(second)} .badge", "Proved")
-    assert states(browser) == ["Proved", "Current"]
+    browser.wait_text(f"{row(second)} .badge", "Rolled-back")
+    browser.wait_text(f"{row(second)} .facts", "by root (status page)")
+    assert states(browser) == ["Rolled-back", "Current"]
     assert (releases.running(), releases.current()) == (first, first)
     assert any("(status page)" in text for text in committed(releases))
     assert browser.failures() == []

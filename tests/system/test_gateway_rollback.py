@@ -80,6 +80,14 @@ def test_clean_keeps_the_releases(front: Front, releases: Releases, project: Pro
     with at_page(front) as page:
         ask(page, releases, first)
         assert acted(page)["text"].endswith(f"runs release {first}")
+        releases.check_only(first)
+        # By itself it takes none that somebody has gone back from.
+        write_version(project, "3")
+        releases.deploy(project.root, *FAST)
+        for text in (f"runs release {first}", "no release before the present one that ran well"):
+            ask(page, releases, "")
+            assert text in str(acted(page))
+    assert list(releases.states().values()) == ["rolled-back", "rolled-back", "current"]
     releases.check_only(first)
 
 

@@ -50,7 +50,7 @@ _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
     type=click.IntRange(min=1),
     metavar="N",
     default=5,
-    help="Releases to keep; the present one and the one before stay in any case; default: 5.",
+    help="Releases to keep; the present one and the one that ran well before stay; default: 5.",
 )
 @duration_option("--build-timeout", "Time that its build may take; default: 30min.", "30min")
 @click.option("--no-build", is_flag=True, help="Do not build; deploy what the project has.")

@@ -33,7 +33,9 @@ def command(
     force: bool,
     wait: bool,
 ) -> int:
-    """Run an older release of a dataflow: the one before the present one, or RELEASE.
+    """Run an older release of a dataflow: the one that ran well before this one, or RELEASE.
+
+    Without RELEASE, it is never one that failed its trial or that a rollback has gone back from.
 
     It is on trial until all its nodes are ready. If it fails, what ran before runs again, and the
     exit status is 11. Refused while a lock inhibits it.

@@ -16,9 +16,17 @@ from pathlib import Path
 from dora_systemd.decisions.releases.choice import Known
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
+from dora_systemd.decisions.releases.past import (
+    MOST_LINES,
+    Switch,
+    format_switch,
+    kept,
+    parse_history,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import STORE, TREE, is_release_id
-from dora_systemd.trust.files import read_file
+from dora_systemd.trust.files import MAX_BYTES, read_file
+from dora_systemd.trust.lines import append_lines, read_lines
 from dora_systemd.trust.paths import sync_directory
 from dora_systemd.trust.programs import spawn
 from dora_systemd.values import shown
@@ -26,6 +34,7 @@ from dora_systemd.values import shown
 MANIFEST = "release.json"
 UNIT = "unit"
 _PROVED = "proved"
+HISTORY = "history"
 _LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 MOST_MANIFEST = 64 * 1024 * 1024
 """Maximum bytes of release.json: 100,000 files have about 20 MB."""
@@ -111,6 +120,18 @@ class Store:
         """Undo prove(). Raises OSError."""
         (self.release(release_id) / _PROVED).unlink(missing_ok=True)
         sync_directory(self.release(release_id))
+
+    def history(self) -> list[Switch]:
+        """The changes of what ran, oldest first. Raises DoraSystemdError (BAD_INPUT)."""
+        return parse_history(read_lines(self.path / HISTORY, MAX_BYTES))
+
+    def record(self, *switches: Switch) -> None:
+        """Append changes of what runs to the history. Raises DoraSystemdError, OSError."""
+        append_lines(self.path / HISTORY, b"".join(map(format_switch, switches)))
+        if len(history := self.history()) > MOST_LINES:
+            stay = kept(history, {one.id for one in self.known()})
+            text = b"".join(map(format_switch, stay)).decode()
+            write_part(self.path, HISTORY, text)
 
     def remove(self, release_id: str) -> None:
         """Remove a release: its name goes first, so that no half release is ever listed."""

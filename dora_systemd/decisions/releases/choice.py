@@ -3,6 +3,8 @@
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
+from dora_systemd.decisions.releases.past import Switch, marks, runs
+
 CURRENT, TRIAL, PROVED, UNPROVED = "current", "trial", "proved", "unproved"
 UNKNOWN = "unknown"
 
@@ -14,31 +16,49 @@ class Known(NamedTuple):
     is_proved: bool
 
 
-def state_of(one: Known, current: str, trial: str) -> str:
-    """The state in one word. current: what the unit file on the disk starts. trial: on trial."""
+def state_of(one: Known, current: str, trial: str, mark: Switch | None = None) -> str:
+    """The state in one word. current: what the unit file on the disk starts. trial: on trial.
+
+    mark: its own of marks().
+    """
     if one.id == trial:
         return TRIAL
     if one.id == current:
         return CURRENT
+    if mark:
+        return mark.how
     return PROVED if one.is_proved else UNPROVED
 
 
-def before(releases: Sequence[Known], current: str) -> str:
-    """The newest release older than `current` that has passed its trial, or "".
+def before(releases: Sequence[Known], current: str, history: Sequence[Switch] = ()) -> str:
+    """The release that ran well before `current`, or "".
 
-    The times in the ids decide. current: "" for the newest of all.
+    Never one that has failed a trial or was rolled back from since it ran well. current: "" for
+    what ran last. history: completed().
     """
-    older = [one.id for one in releases if one.is_proved and (not current or one.id < current)]
-    return max(older, default="")
+    bad = marks(history)
+    good = {one.id for one in releases if one.is_proved}
+    ran = runs(history, good)
+    if current in ran:
+        ran = ran[: ran.index(current)]
+    return next((one for one in reversed(ran) if one in good and one not in bad), "")
 
 
 def surplus(
-    releases: Sequence[Known], keep: int, current: str, used: Collection[str] = ()
+    releases: Sequence[Known],
+    keep: int,
+    current: str,
+    used: Collection[str] = (),
+    history: Sequence[Switch] = (),
 ) -> list[str]:
-    """The releases that go, oldest first: all but the `keep` newest ones.
+    """The releases that go, oldest first: all but `keep`.
 
-    The current one, the one before it and those of `used` stay in any case.
+    Those that have not run well go before those that have, and older ones before newer ones. The
+    current one, the one before it and those of `used` stay in any case.
     """
-    newest = sorted((one.id for one in releases), reverse=True)
-    stay = {*newest[:keep], current, before(releases, current), *used}
-    return sorted(one for one in newest if one not in stay)
+    bad = marks(history)
+    ids = sorted((one.id for one in releases), reverse=True)
+    good = [one.id for one in releases if one.is_proved and one.id not in bad]
+    ranked = [*sorted(good, reverse=True), *(one for one in ids if one not in good)]
+    stay = {*ranked[:keep], current, before(releases, current, history), *used}
+    return sorted(one for one in ids if one not in stay)

@@ -12,6 +12,7 @@ from dora_systemd.decisions.views.dataflows import (
     local_time,
 )
 from dora_systemd.decisions.views.releases import HEADER as RELEASES
+from dora_systemd.decisions.views.releases import WHY, format_cells
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.selection import sorted_rows
 from dora_systemd.values import format_rounded_size
@@ -86,7 +87,8 @@ def cells_of(value: Mapping[str, Any]) -> list[str] | None:
     ]
     programs = (versions.get(one) for one in PROGRAMS)
     shown = (one if isinstance(one, str) else UNKNOWN for one in programs)
-    return [*map(str, texts), *numbers, *shown]
+    why = value.get("why")
+    return [*map(str, texts), *numbers, *shown, why if isinstance(why, str) else UNKNOWN]
 
 
 def format_releases(
@@ -97,8 +99,8 @@ def format_releases(
     """The table of releases, "" without one. found: as of format_hosts(), the cells of rows."""
     header = ["HOST", *RELEASES]
     lines = [[host, *cells] for host, some in found.items() for cells in some or ()]
-    lines += [_dead(host, header, "STATE") for host, some in found.items() if some is None]
-    return format_table(header, lines, width, want_colors) if lines else ""
+    dead = [_dead(host, [*header, WHY], "STATE") for host, some in found.items() if some is None]
+    return format_cells(header, lines + dead, width, want_colors) if lines or dead else ""
 
 
 def _dead(host: str, header: Sequence[str], column: str = "STATUS") -> list[str]:

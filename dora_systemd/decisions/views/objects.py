@@ -10,6 +10,7 @@ from typing import Any
 
 from dora_systemd.decisions.cell.counters import WHOLE_CELL
 from dora_systemd.decisions.cell.machines import HEAD
+from dora_systemd.decisions.releases.past import Switch
 from dora_systemd.decisions.views.inhibitors import holder_object
 from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.errors import DoraSystemdError
@@ -37,6 +38,19 @@ def moment(key: str, at_us: int) -> dict[str, Any]:
     if not at_us:
         return {key: None, f"{key}_us": None}
     return {key: format_moment(at_us), f"{key}_us": at_us}
+
+
+def switch_object(name: str, one: Switch) -> dict[str, Any]:
+    """A change of what runs for `-o json`. name: of the dataflow."""
+    return {
+        "name": name,
+        **moment("at", one.at_us),
+        "from": one.former or None,
+        "to": one.release or None,
+        "ended": one.how,
+        "by": one.by or None,
+        "reason": one.reason or None,
+    }
 
 
 def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None) -> dict[str, Any]:

@@ -21,12 +21,19 @@ _HOW = {"node-watchdog": "hung, ", "node-waiting": "waits for "}
 class Fault(NamedTuple):
     """Why a release has failed its trial. node: the first that failed, or "".
 
-    is_stop: somebody has stopped the dataflow, so nothing is started in its place.
+    is_stop: somebody has stopped the dataflow, so nothing is started in its place. is_outside: the
+    trial could not go on, whatever the release is like.
     """
 
     reason: str
     node: str = ""
     is_stop: bool = False
+    is_outside: bool = False
+
+    @property
+    def is_verdict(self) -> bool:
+        """Whether it tells that the release is bad."""
+        return not (self.is_stop or self.is_outside)
 
 
 def find_fault(happenings: Sequence[Happening], before: str) -> Fault | None:

@@ -8,6 +8,7 @@ from dora_systemd.decisions.cell.asked import format_stopped
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.logs.events import BUILD_FAILED, ROLLED_BACK
+from dora_systemd.decisions.releases.past import Switch
 from dora_systemd.decisions.views.dataflows import (
     RESTARTING,
     UNKNOWN,
@@ -60,7 +61,8 @@ class Report:
     """The output of `doractl why`. words: the last lines, of verdict.node or of all nodes.
 
     inhibitors: who inhibits a restart now. is_held: verdict.node waits for a hot reload. machines:
-    the other ones by name, each with its host, or "" if that is not known.
+    the other ones by name, each with its host, or "" if that is not known. undone: the last change
+    in the history of releases, if it was no new release.
     """
 
     subject: Subject
@@ -70,6 +72,7 @@ class Report:
     inhibitors: tuple[Holder, ...] = ()
     is_held: bool = False
     machines: Mapping[str, str] = field(default_factory=dict)
+    undone: Switch | None = None
 
 
 def remedies(report: Report) -> list[str]:
@@ -170,7 +173,7 @@ def _facts(report: Report) -> list[str]:
         "Unit": f"{subject.unit} ({subject.uuid})",
         "File": subject.file,
         "Release": release_of(subject.file),
-        "Undone": _undone(verdict),
+        "Undone": _undone(report),
     }
     return [f"{key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
 
@@ -181,13 +184,20 @@ def _machine_words(machines: Mapping[str, str]) -> str:
     return ", ".join((HEAD, *others)) if machines else ""
 
 
-def _undone(verdict: Verdict) -> str:
-    """The last release that failed its build or trial before this life, if it is recorded."""
-    found = [one for one in verdict.timeline if one.name in (BUILD_FAILED, ROLLED_BACK)]
+def _undone(report: Report) -> str:
+    """The last release that failed its build or trial or was rolled back from, if it is known."""
+    names = (BUILD_FAILED,) if report.undone else (BUILD_FAILED, ROLLED_BACK)
+    found = [
+        (one.at_us, one.detail("release"), one.detail("reason"))
+        for one in report.verdict.timeline
+        if one.name in names
+    ]
+    if end := report.undone:
+        found.append((end.at_us, end.former, end.reason or f"rolled back by {end.by or UNKNOWN}"))
     if not found:
         return ""
-    one = found[-1]
-    return f"{one.detail('release')} at {zoned_time(one.at_us)}: {one.detail('reason')}"
+    at_us, release, reason = max(found)
+    return f"{release} at {zoned_time(at_us)}: {reason}"
 
 
 def _budget_words(report: Report) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dora_systemd.decisions.views.objects import dataflow_object, moment
+from dora_systemd.decisions.views.objects import dataflow_object, moment, switch_object
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.lives import parse_number
 from dora_systemd.decisions.why.report import Report, remedies
@@ -41,6 +41,7 @@ def report_object(report: Report, row: DataflowRow) -> dict[str, Any]:
         "given_up": verdict.is_given_up,
         "details": _details(verdict.details),
         "starved": list(verdict.starved),
+        "undone": switch_object(report.subject.name, report.undone) if report.undone else None,
         **_history(report),
         "remedies": remedies(report),
     }

@@ -26,7 +26,7 @@ class ReleaseRow {
     showState(this.badge, one.state);
     const parts = [one.created_us ? since(one.created_us) : "",
       one.size_bytes == null ? "" : `${bytes(one.size_bytes)} in ${plural(one.files, "file")}`,
-      versionWords(one.versions ?? {})];
+      versionWords(one.versions ?? {}), one.why ?? ""];
     say(this.facts, parts.filter(Boolean).join(" · "));
     this.button.hidden = one.state === "trial" || (one.state === "current" && !hasTrial);
     this.button.disabled = !isFree;

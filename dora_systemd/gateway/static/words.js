@@ -55,6 +55,7 @@ const TONES = {
   starting: "busy", stopping: "busy", restarting: "warn", reloading: "busy", degraded: "warn",
   waiting: "warn", failed: "bad", silent: "warn",
   current: "good", trial: "busy", proved: "calm", unproved: "warn",
+  "rolled-back": "warn",
 };
 
 /** The state of a node; one that runs and sends nothing is silent. */

@@ -26,6 +26,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.inhibit.guard import IfInhibited, uninhibited
+from dora_systemd.verbs.releases.past import KILLED, note_fault, note_run
 from dora_systemd.verbs.releases.soak import START_LIMIT, Gate, Tell, settle
 from dora_systemd.verbs.releases.trial import (
     Standing,
@@ -39,8 +40,6 @@ from dora_systemd.verbs.releases.trial import (
 )
 from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.claim import make_room
-
-KILLED = "the command that tried it was killed"
 
 
 @dataclass(frozen=True)
@@ -98,14 +97,15 @@ def _try(
                 mark.make()
                 commit(manager, standing, change.text, change.want_boot)
         except KeyboardInterrupt:
-            fault = Fault("the command was interrupted")
+            fault = Fault("the command was interrupted", is_outside=True)
         except DoraSystemdError as error:
-            fault = Fault(error.message)
+            fault = Fault(error.message, is_outside=True)
         except Exception as error:  # a terminal that is gone, too
-            fault = Fault(f"the command failed: {words_of(error)}")
+            fault = Fault(f"the command failed: {words_of(error)}", is_outside=True)
         if fault is not None:
             _ignore_signals()
             raise _roll_back(manager, standing, change, fault, mark, tell)
+        note_run(store, standing, change.release, change.by)
         _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
         end_trial(manager, standing)
@@ -136,22 +136,22 @@ class _Mark:
     """The note that a release has passed its trial, which a commit that fails takes back."""
 
     def __init__(self, store: Store, release: str) -> None:
-        self._store = store
+        self.store = store
         self._release = release
         self._was_there = store.is_proved(release)
 
     def make(self) -> None:
         """Make it. Raises DoraSystemdError."""
         try:
-            self._store.prove(self._release)
+            self.store.prove(self._release)
         except OSError as error:
-            raise unusable(self._store.release(self._release), error) from error
+            raise unusable(self.store.release(self._release), error) from error
 
     def take_back(self) -> None:
         """Remove it, unless it is from an earlier trial."""
         if not self._was_there:
             with suppress(OSError):  # the way back is worth more
-                self._store.doubt(self._release)
+                self.store.doubt(self._release)
 
 
 def _roll_back(
@@ -159,6 +159,7 @@ def _roll_back(
 ) -> DoraSystemdError:
     """Go back to what was there before; the error that tells it."""
     mark.take_back()
+    note_fault(mark.store, standing, change.release, fault, change.by)
     name, former, tell = change.options.name, standing.current, _calm(tell)
     tell(judged(change.release, fault.reason))
     want_start = standing.was_up and not fault.is_stop
@@ -191,13 +192,14 @@ def _end_killed(scope: Scope, standing: Standing, change: Change, life: str, mar
     now = read_standing(manager, scope, unit)
     if now.current == change.release != standing.current:
         commit(manager, now, change.text, change.want_boot)  # it may lack its link
+        note_run(mark.store, standing, change.release, change.by)
         end_trial(manager, now)
         return
     if read_life(manager, unit) == life:
         end_trial(manager, standing)
     # Once more: a restart may have been on its way.
     if read_life(manager, unit) != life:
-        _roll_back(manager, standing, change, Fault(KILLED), mark, lambda _: None)
+        _roll_back(manager, standing, change, Fault(KILLED, is_outside=True), mark, lambda _: None)
 
 
 def _note_stop(manager: Manager, change: Change) -> None:

@@ -24,6 +24,7 @@ from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.copy import copy_project, newest, repository_owners
 from dora_systemd.verbs.releases.files import digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
+from dora_systemd.verbs.releases.past import read_past
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import (
     Source,
@@ -168,7 +169,8 @@ def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) 
     with suppress(DoraSystemdError, OSError):
         standing = read_standing(manager, scope, unit_name(store.name))
         used = {latest, standing.trial}
-        for release in surplus(store.known(), keep, standing.current, used):
+        past = read_past(store, standing.current)
+        for release in surplus(store.known(), keep, standing.current, used, past):
             store.remove(release)
 
 

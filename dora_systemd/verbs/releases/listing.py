@@ -10,12 +10,14 @@ from dora_systemd.adapters.releases.incoming import leftovers
 from dora_systemd.adapters.releases.store import Store, is_locked, store_root
 from dora_systemd.decisions.releases.choice import UNKNOWN, UNPROVED, Known, state_of
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.past import Switch, begins, ends, marks
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.decisions.views.releases import ReleaseRow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_name, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import list_directory
+from dora_systemd.verbs.releases.past import read_past
 from dora_systemd.verbs.releases.remains import remains
 from dora_systemd.verbs.releases.trial import Standing, read_standing
 
@@ -55,18 +57,29 @@ def read_releases(manager: Manager, scope: Scope, names: Sequence[str]) -> list[
         except DoraSystemdError:
             if len(names) == 1:
                 raise
-        rows += [_row(store, standing, one) for one in reversed(store.known())]
+        past: list[Switch] = []
+        with suppress(DoraSystemdError):  # only its owner may read it
+            past = read_past(store, standing.current if standing else "")
+        rows += [_row(store, standing, one, past) for one in reversed(store.known())]
     return rows
 
 
-def _row(store: Store, standing: Standing | None, one: Known) -> ReleaseRow:
+def read_history(manager: Manager, scope: Scope, name: str) -> list[Switch]:
+    """What ran of a dataflow, newest first. Raises DoraSystemdError."""
+    current = read_standing(manager, scope, unit_name(name)).current
+    return read_past(store_of(scope, name), current)[::-1]
+
+
+def _row(store: Store, standing: Standing | None, one: Known, past: Sequence[Switch]) -> ReleaseRow:
     manifest: Manifest | None = None
     with suppress(DoraSystemdError):  # others than root may not look into it
         manifest = store.manifest(one.id)
-    state = state_of(one, standing.current, standing.trial) if standing else UNKNOWN
+    mark, end = marks(past).get(one.id), ends(past).get(one.id)
+    state = state_of(one, standing.current, standing.trial, mark) if standing else UNKNOWN
     if manifest is None and state == UNPROVED:
         state = UNKNOWN
-    return ReleaseRow(store.name, one.id, state, str(store.tree(one.id)), manifest)
+    facts = (store.name, one.id, state, str(store.tree(one.id)), manifest)
+    return ReleaseRow(*facts, begins(past).get(one.id, 0), mark or end)
 
 
 def judge_releases(manager: Manager, scope: Scope) -> Iterator[Finding]:

@@ -7,6 +7,7 @@ from dora_systemd.decisions.releases.choice import before
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.unit.file import runner_of
+from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean, unit_name
 from dora_systemd.scope import Scope
@@ -14,10 +15,11 @@ from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted, shown
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
-from dora_systemd.verbs.releases.change import KILLED, Change, change_release, stop_observer
+from dora_systemd.verbs.releases.change import Change, change_release, stop_observer
 from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
+from dora_systemd.verbs.releases.past import KILLED, note_fault, read_past
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.trial import (
     Standing,
@@ -103,6 +105,7 @@ def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell
     """End the trial of a release that has none before it: what was there before runs again."""
     for cell in standing.running:
         note_request("stop-asked", cell.name, cell.uuid, by)
+    note_fault(store, standing, standing.trial, Fault(KILLED, is_outside=True), by)
     go_back(manager, standing, standing.was_up, stop_observer(tell))
     uuid = standing.uuid or store.manifest(standing.trial).uuid
     details = {"release": standing.trial, "former": "", "nodes": "", "reason": KILLED}
@@ -111,18 +114,22 @@ def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell
 
 
 def _choose(store: Store, standing: Standing, release: str | None) -> str:
-    known = store.known()
-    ids = [one.id for one in known]
     if release is None:
         # A trial whose doractl was killed: what is on the disk has proved itself.
-        chosen = standing.current if standing.trial else before(known, standing.current)
-        if not chosen:
-            hint = f"doractl releases {store.name} lists all"
-            message = f"{store.name} has no release before the present one"
-            raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
-        return chosen
+        return standing.current if standing.trial else _before(store, standing)
+    ids = [one.id for one in store.known()]
     if release not in ids or not is_directory(store.tree(release)):
         hint = did_you_mean(release, ids) or f"doractl releases {store.name} lists all"
         message = f"{store.name} has no release {quoted(release)}"
         raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
     return release
+
+
+def _before(store: Store, standing: Standing) -> str:
+    """The release that ran well before the present one; never one that somebody went back from."""
+    past, current = read_past(store, standing.current), standing.current
+    if chosen := before(store.known(), current, past):
+        return chosen
+    hint = f"doractl releases {store.name} lists all; give the id of one to run it in any case"
+    message = f"{store.name} has no release before the present one that ran well"
+    raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)

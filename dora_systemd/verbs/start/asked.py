@@ -14,10 +14,15 @@ def note_request(event: str, name: str, uuid: str, command: str, **details: str)
 
     command: by which it is asked, such as "doractl stop". details: as in event_fields().
     """
-    by = f"{caller(os.getuid(), os.environ)} ({command})"
+    by = requester(command)
     fields = event_fields(event, dataflow=name, by=by, **details)
     own = {"DORA_DATAFLOW": uuid, "DORA_DATAFLOW_NAME": name, "SYSLOG_IDENTIFIER": "doractl"}
     send_note(encode_entry({**fields, **own}))
+
+
+def requester(command: str) -> str:
+    """Who asks in this process, and by which command, as in "root (doractl stop)"."""
+    return f"{caller(os.getuid(), os.environ)} ({command})"
 
 
 def caller(uid: int, environ: Mapping[str, str]) -> str:

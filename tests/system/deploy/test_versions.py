@@ -34,7 +34,7 @@ def test_a_bad_version_is_undone(releases: Releases, project: Project, bad: Vers
         assert releases.cell.show("InvocationID") == life, "it was never stopped"
         assert list(releases.states().values()) == ["current"]
         return
-    assert list(releases.states().values()) == ["unproved", "current"]
+    assert list(releases.states().values()) == ["failed", "current"]
     why = releases.cell.doractl("why", releases.cell.name).stdout
     assert bad.why in why.partition("Undone:")[2].splitlines()[0]
     assert "by whom is not recorded" not in why

@@ -146,8 +146,8 @@ def test_transcripts(path: Path) -> None:
     check(line for line in wanted if "doractl" in line)
 
 
-def test_there_are_fifteen_transcripts() -> None:
-    assert len(TASKS) == 15
+def test_there_are_sixteen_transcripts() -> None:
+    assert len(TASKS) == 16
 
 
 def test_commands_in_messages() -> None:

@@ -99,14 +99,14 @@ LATE = {
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},
     },
-    "most dataflows run on one machine, and most links are not lost": {
+    "most dataflows run on one machine and have no releases, and most links are not lost": {
         "decisions.cell.launch": {"decisions.cell.placed"},
         "runner.roles": {"runner.machines.head", "runner.machines.member"},
         "gateway.control.logs": {"decisions.machines.elsewhere"},
         "gateway.live.lines": {"decisions.machines.elsewhere"},
         "cli.foreground": {"verbs.facts.machines", "verbs.remote.attached"},
         "verbs.start.plan": {"adapters.host.addresses", "decisions.machines.spread"},
-        "verbs.why": {"verbs.facts.machines"},
+        "verbs.why": {"verbs.facts.machines", "verbs.releases.listing"},
         "verbs.start.unit": {"decisions.machines.link_unit"},
         "verbs.start.claim": {"decisions.machines.link_unit"},
         "verbs.start.enable": {"decisions.machines.link_unit"},

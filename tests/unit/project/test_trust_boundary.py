@@ -46,7 +46,7 @@ OTHERWISE = (
 
 _TABLE = {
     DOOR: """
-        trust.courier trust.eyes trust.locks trust.paths trust.project trust.programs
+        trust.courier trust.eyes trust.lines trust.locks trust.paths trust.project trust.programs
         trust.sight trust.sockets trust.terminals trust.tree
     """,
     OWN: """

@@ -89,7 +89,7 @@ def test_a_release_that_fails_stays_to_be_looked_at(bench: Bench) -> None:
     assert error.code is ExitCode.ROLLED_BACK
     assert error.message.startswith(f"release {latest} of robot was rolled back: ")
     assert error.hint == f"{first.release} runs again; doractl why robot tells more"
-    assert bench.releases == {first.release: "current", latest: "unproved"}
+    assert bench.releases == {first.release: "current", latest: "failed"}
     assert bench.manager.units[UNIT]["ActiveState"] == "active"
     standing = read_standing(bench.manager, bench.scope, UNIT)
     assert (standing.current, standing.path.exists()) == (first.release, False)
@@ -101,7 +101,7 @@ def test_a_first_release_that_fails_leaves_nothing_running(bench: Bench) -> None
     bench.manager.state = "failed"
     assert refused(bench).hint == "nothing of it runs; doractl why robot tells more"
     assert ("StopUnit", UNIT) in bench.manager.calls
-    assert [*bench.releases.values()] == ["unproved"]
+    assert [*bench.releases.values()] == ["failed"]
     bench.manager.state = "active"
     uuid = bench.store.manifest(*bench.releases).uuid
     assert bench.deploy().uuid == uuid, "it is the same dataflow"

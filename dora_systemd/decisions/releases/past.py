@@ -1,0 +1,161 @@
+"""The history of what ran of a dataflow: a line for each change of it. Pure."""
+
+import json
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, NamedTuple
+
+from dora_systemd.names import is_release_id
+
+REPLACED, ROLLED_BACK, FAILED = "replaced", "rolled-back", "failed"
+INTERRUPTED, REMOVED = "interrupted", "removed"
+ENDS = (REPLACED, ROLLED_BACK, FAILED, INTERRUPTED, REMOVED)
+"""Why a release no longer runs: FAILED its trial; INTERRUPTED in it, which is no fault of it."""
+_BAD = (ROLLED_BACK, FAILED)
+_TRIALS = (FAILED, INTERRUPTED)
+MOST_LINES = 256
+_MOST_BYTES = 800
+"""Maximum bytes of a text in a line."""
+
+
+class Switch(NamedTuple):
+    """One change of what runs.
+
+    at_us: CLOCK_REALTIME µs. former: the release that ended, "" if none ran. release: the one that
+    runs since, or "". how: why `former` ended, one of ENDS. by: who asked; "" if that is not known.
+    """
+
+    at_us: int
+    former: str
+    release: str
+    how: str
+    by: str = ""
+    reason: str = ""
+
+    @property
+    def is_commit(self) -> bool:
+        """Whether `release` has passed a trial with this change."""
+        return bool(self.release) and self.how not in (*_TRIALS, REMOVED)
+
+
+def format_switch(one: Switch) -> bytes:
+    """One line of the file."""
+    value = {
+        "at_us": one.at_us,
+        "from": one.former,
+        "to": one.release,
+        "ended": one.how,
+        "by": _cut(one.by),
+        "reason": _cut(one.reason),
+    }
+    return json.dumps(value).encode() + b"\n"
+
+
+def parse_history(data: bytes) -> list[Switch]:
+    """The changes in the file, oldest first. A line that is cut off or damaged is left out."""
+    whole = data[: data.rfind(b"\n") + 1]
+    return [found for line in whole.splitlines() if (found := _parse(line))]
+
+
+def completed(history: Sequence[Switch], current: str, at_us: int = 0) -> list[Switch]:
+    """The history, with the change that a power cut has kept from being written.
+
+    current: the release that every start runs, or "". at_us: the time of that change, if known.
+    """
+    last = _last_run(history)
+    if not history or not current or last == current:
+        return [*history]
+    return [*history, Switch(at_us, last, current, how_of(history, current))]
+
+
+def how_of(history: Sequence[Switch], release: str, known: Collection[str] = ()) -> str:
+    """Why the present release ends when `release` takes its place.
+
+    known: as of runs().
+    """
+    return ROLLED_BACK if release in runs(history, known)[:-1] else REPLACED
+
+
+def runs(history: Sequence[Switch], known: Iterable[str] = ()) -> list[str]:
+    """The releases that ran one after the other, the present one last.
+
+    Those that a rollback has gone back over are left out. known: releases that have passed a trial;
+    those older than all that the history names ran before it.
+    """
+    named = {id_ for one in history for id_ in (one.former, one.release) if id_}
+    found = sorted(one for one in set(known) if not named or one < min(named))
+    for one in history:
+        if one.how == REMOVED:
+            found = [id_ for id_ in found if id_ != one.former]
+        elif one.release in found:
+            del found[found.index(one.release) + 1 :]
+        elif one.release:
+            found.append(one.release)
+    return found
+
+
+def marks(history: Sequence[Switch]) -> dict[str, Switch]:
+    """The releases that failed a trial or were rolled back from, and how.
+
+    A mark ends when the release passes a trial after that, which somebody has asked for by name.
+    """
+    found: dict[str, Switch] = {}
+    for one in history:
+        if one.how in _BAD and one.former:
+            found[one.former] = one
+        if one.is_commit:
+            found.pop(one.release, None)
+        if one.how == REMOVED:
+            found.pop(one.former, None)
+    return found
+
+
+def ends(history: Sequence[Switch]) -> dict[str, Switch]:
+    """The last end of each release."""
+    return {one.former: one for one in history if one.former}
+
+
+def begins(history: Sequence[Switch]) -> dict[str, int]:
+    """When each release began to run the last time, in µs."""
+    found: dict[str, int] = {}
+    for one in history:
+        if one.release and one.former != one.release:
+            found[one.release] = one.at_us
+    return found
+
+
+def undone(history: Sequence[Switch]) -> Switch | None:
+    """The last change, if it was no new release that has passed its trial."""
+    last = next((one for one in reversed(history) if one.how != REMOVED), None)
+    return last if last and last.how != REPLACED else None
+
+
+def kept(history: Sequence[Switch], known: Collection[str]) -> list[Switch]:
+    """The changes that stay in a file that has become too long.
+
+    known: all releases in the store; what happened to others alone goes first.
+    """
+    named = [one for one in history if one.former in known or (one.is_commit and one.release)]
+    return named[-MOST_LINES // 2 :]
+
+
+def _last_run(history: Sequence[Switch]) -> str:
+    """The release that runs as far as the history tells, or ""."""
+    found = (one.release for one in reversed(history) if one.how != REMOVED)
+    return next(found, "")
+
+
+def _cut(text: str) -> str:
+    line = " ".join(text.split())
+    return line.encode("utf-8", "replace")[:_MOST_BYTES].decode("utf-8", "ignore")
+
+
+def _parse(line: bytes) -> Switch | None:
+    try:
+        value: Any = json.loads(line)
+        former, release, how = str(value["from"]), str(value["to"]), str(value["ended"])
+        at_us = int(value["at_us"])
+        by, reason = str(value["by"]), str(value["reason"])
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
+        return None
+    is_ours = how in ENDS and all(not one or is_release_id(one) for one in (former, release))
+    return Switch(at_us, former, release, how, by, reason) if is_ours else None
