@@ -38,12 +38,13 @@ def uuid_of(printed: str) -> str:
 
 
 ALICE_AND_BOB = (
-    "doractl: alice, bob can log in here and can read, forge and end what the nodes "
-    "exchange; --network private prevents it, --network host is for those you trust\n"
+    "doractl: alice, bob can log in and reach what the nodes exchange; "
+    "--network private prevents it, --network host accepts it\n"
 )
 
 
 def test_start_prints_what_users_know(cell: Cell, project: Project) -> None:
+    run("systemctl", cell.scope.flag, "stop", "dora.slice", check=False)
     done = cell.start(project.three_nodes())
     name = cell.name
     assert done.stdout == (
@@ -55,8 +56,10 @@ def test_start_prints_what_users_know(cell: Cell, project: Project) -> None:
         "Use 'doractl list' to view status\n"
         f"Use 'doractl logs {name}' to view logs\n"
     )
-    # The lab has two users besides.
+    # The lab has two users besides. They are named once in each boot.
     assert done.stderr in ("", ALICE_AND_BOB)
+    cell.end()
+    assert cell.start(project.three_nodes()).stderr == ""
 
 
 @pytest.mark.lab

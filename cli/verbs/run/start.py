@@ -37,7 +37,7 @@ from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.job import Started, format_started, start_unit
 from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
-from dora_systemd.verbs.start.logins import start_notes
+from dora_systemd.verbs.start.logins import has_run_here, start_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
@@ -117,17 +117,19 @@ def command(
     claimed = claim(bus, scope, request, "doractl start", want_boot)
     print_warnings(claimed.warnings)
     print_warnings([ensure_linger(scope) if want_boot else ""])
-    notes = [*start_notes(claimed.plan), *claimed.plan.notes]
+    logins = () if has_run_here(bus) else start_notes(claimed.plan)
+    notes = [*claimed.plan.notes, *logins]
     if want_logs:
         return _attach(bus, claimed, notes)
     options = claimed.plan.options
     with _last_words(bus, scope, options.uuid), StageLine(sys.stderr) as stage:
         how = (claimed.properties, stage, not no_wait, claimed.links)
         started = start_unit(bus, scope, options, *how)
+    status = _print_started(started, options.dataflow, watched_patterns(claimed.plan))
     # Only after the start: a refusal must be one line and a hint.
     print_warnings([*notes, *waiting_notes(bus, options)])
     print_warnings(held_notes(bus, options.name) if no_wait else ())
-    return _print_started(started, options.dataflow, watched_patterns(claimed.plan))
+    return status
 
 
 def _push(bus: Bus, scope: Scope, request: StartRequest) -> None:

@@ -8,10 +8,12 @@ addresses and ports. So a dataflow needs a private network namespace to be prote
 from collections.abc import Iterator
 from pathlib import Path
 
+from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.files import read_text
 from dora_systemd.decisions.settings.sandbox import NETWORK
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.plan import Plan
 
@@ -37,8 +39,13 @@ def login_users(passwd: str) -> list[str]:
     ]
 
 
+def has_run_here(manager: Manager) -> bool:
+    """Whether a dataflow has been started since the boot: its slice stays active after its end."""
+    return bool(manager.read(SLICE, ["ActiveState"])["ActiveState"] == "active")
+
+
 def start_notes(plan: Plan, passwd: Path = PASSWD) -> Iterator[str]:
-    """Warnings about other users, for someone who starts a dataflow.
+    """Warnings about other users, for someone who starts the first dataflow since the boot.
 
     There is no warning if the settings name the host's network explicitly.
     """
@@ -53,8 +60,8 @@ def start_notes(plan: Plan, passwd: Path = PASSWD) -> Iterator[str]:
         # Machines only meet in the network of the host.
         way = "" if plan.members else "--network private prevents it, "
         yield (
-            f"{_names(others)} can log in here and can read, forge and end what the nodes "
-            f"exchange; {way}--network host is for those you trust"
+            f"{_names(others)} can log in and reach what the nodes exchange; "
+            f"{way}--network host accepts it"
         )
 
 

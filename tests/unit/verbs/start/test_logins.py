@@ -40,9 +40,9 @@ def test_people_with_a_shell() -> None:
 
 def test_the_others_are_named(passwd: Path) -> None:
     (note,) = start_notes(plan("dora"), passwd)
-    assert note.startswith("alice, bob can log in here")
+    assert note.startswith("alice, bob can log in and")
     (note,) = start_notes(plan("alice"), passwd)
-    assert note.startswith("bob can log in here")
+    assert note.startswith("bob can log in and")
     assert list(start_notes(plan("dora", network="loopback"), passwd))
     (finding,) = judge_logins(SYSTEM, passwd)
     assert finding.text.startswith("alice, bob can log in")
