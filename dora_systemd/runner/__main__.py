@@ -12,11 +12,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dora_systemd.decisions.cell.environment import node_environment
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import enter_supervisor, leave_out_openssl, start_coordinator
+from dora_systemd.runner.cell.begin import (
+    enter_supervisor,
+    leave_out_openssl,
+    nodes_environment,
+    start_coordinator,
+)
 from dora_systemd.runner.cell.pause import pause
 
 if TYPE_CHECKING:
@@ -38,7 +42,7 @@ def begin(argv: list[str]) -> "Begun | None":
             unit = enter_supervisor()
             paths = CellPaths(Path(directory))
             pause(options, paths)
-            environment = node_environment(os.environ)
+            environment = nodes_environment(options.working_directory)
             if options.placed:
                 return begin_shared(options, paths, unit, environment)
             coordinator = start_coordinator(options.dora, paths, environment)

@@ -17,7 +17,6 @@ from pathlib import PurePath
 
 from dora_systemd.adapters.host.notify import send_status
 from dora_systemd.adapters.journal.socket import JournalSocket
-from dora_systemd.decisions.cell.environment import node_environment
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.decisions.life.refusal import format_refusal
@@ -31,6 +30,7 @@ from dora_systemd.decisions.releases.build import (
     shown_line,
 )
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.begin import nodes_environment
 from dora_systemd.trust.programs import own_account, spawn
 from dora_systemd.values import quoted
 
@@ -106,7 +106,7 @@ class Output:
 def run_command(command: Sequence[str], directory: str, output: Output) -> int:
     """Run a command to its end: its exit status. Raises Gone, OSError and DoraSystemdError."""
     output.begin(command)
-    environment = {**node_environment(os.environ), "RUST_BACKTRACE": "0", "NO_COLOR": "1"}
+    environment = {**nodes_environment(directory), "RUST_BACKTRACE": "0", "NO_COLOR": "1"}
     child = spawn(command, own_account(), environment, directory, stderr=subprocess.STDOUT)
     assert child.stdout
     end = os.pidfd_open(child.pid)

@@ -5,18 +5,17 @@ the runner's exit status; otherwise it prints the versions of dora and of the no
 starts nothing but dora's own checks and that Python.
 """
 
-import os
 import sys
 
 from dora_systemd.adapters.dora.check import DoraCheck
 from dora_systemd.adapters.dora.command import python_version
 from dora_systemd.adapters.dora.preparation import prepare
-from dora_systemd.decisions.cell.environment import node_environment
 from dora_systemd.decisions.cell.launch import python_of
 from dora_systemd.decisions.cell.options import parse_runner_argv
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
 from dora_systemd.decisions.releases.versions import format_versions
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.begin import nodes_environment
 from dora_systemd.runner.nodes.rights import check_first
 
 
@@ -24,7 +23,7 @@ def main(argv: list[str]) -> int:
     """Check the dataflow that `argv` describes; the exit status of a runner."""
     try:
         options = parse_runner_argv(argv)
-        environment = node_environment(os.environ)
+        environment = nodes_environment(options.working_directory)
         check = DoraCheck(options, environment)
         prepared = check.beside(lambda: prepare(options, environment))
         check_first(options, prepared.dataflow)

@@ -23,7 +23,7 @@ from dora_systemd.adapters.host import fd_store, notify
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import serve
-from dora_systemd.decisions.cell.environment import node_environment, with_changes
+from dora_systemd.decisions.cell.environment import with_changes
 from dora_systemd.decisions.cell.launch import kinds
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.decisions.descriptor.wiring import downstream_of
@@ -38,7 +38,12 @@ from dora_systemd.names import settings_path
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.asked.hand import end_held
 from dora_systemd.runner.asked.requests import NodeRequests
-from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor, make_lock
+from dora_systemd.runner.cell.begin import (
+    daemon_variables,
+    enter_supervisor,
+    make_lock,
+    nodes_environment,
+)
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
@@ -133,7 +138,7 @@ class Runs:
         for path in (paths.work, paths.io):
             path.mkdir(mode=0o700, exist_ok=True)
         make_lock(paths.lock)
-        self.environment = node_environment(os.environ)
+        self.environment = nodes_environment(options.working_directory)
         settings = SettingsFile(settings_path(options.dataflow), paths.settings)
         self.reloader = Reloader(options, self.environment, settings, given)
         self.nodes = Nodes(self.unit, paths, pipes, self.role.own(options).watchdogs)

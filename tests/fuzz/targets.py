@@ -14,7 +14,7 @@ from typing import Any
 from dora_systemd.adapters.dora.command import parse_dora_version, version_numbers
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.adapters.runner_socket.client import parse_line
-from dora_systemd.decisions.cell.environment import parse_environment_file
+from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.exits import parse_exit
 from dora_systemd.decisions.cell.limits import parse_changes
 from dora_systemd.decisions.cell.line_rates import parse_rates

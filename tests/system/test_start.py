@@ -191,14 +191,16 @@ def test_a_directory_that_the_user_cannot_enter(cell: Cell, project: Project) ->
 def test_environment(cell: Cell, project: Project) -> None:
     script = (
         "import os\nfrom dora import Node\nnode = Node()\n"
-        "print(os.environ['A'], os.environ['B'], os.environ['C'], flush=True)\n"
+        "print(*(os.environ[key] for key in 'ABCJP'), flush=True)\n"
         "for event in node: pass\n"
     )
     project.write("shows.py", script)
-    file = project.write("variables", "A=file\nB='from file'\n# comment\n")
-    flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: shows.py, {TICK}}}]")
+    file = project.write("variables", "A=file\nB='from file'\n# comment\nJ={\"a\": 1}\n")
+    place = "env: {P: '${PWD}/lib'}"
+    flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: shows.py, {TICK}, {place}}}]")
     cell.start(flow, "--env-file", str(file), "--env", "A=flag", "--env", "C=50% of $HOME")
-    wait_for("it prints", lambda: "flag from file 50% of $HOME" in cell.messages("one"))
+    line = f'flag from file 50% of $HOME {{"a": 1}} {project.root}/lib'
+    wait_for("it prints", lambda: line in cell.messages("one"))
 
 
 @pytest.mark.warns("exit code 1", "ExitCode(1)", "Failed", "No module", "Traceback", "File ")

@@ -14,6 +14,9 @@ from dora_systemd.adapters.dora.command import dora_version, find_dora, refusal_
 from dora_systemd.adapters.host.files import parse_yaml, read_text
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.descriptor.expansion import unset_variables
+from dora_systemd.decisions.dora.errors import UNSET, UNSET_OR_OTHER
 from dora_systemd.decisions.dora.inputs import UNNAMED, name_input
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
@@ -67,11 +70,11 @@ class DoraCheck:
         check_access(options)
         self.version()
         if reason := self._refusal.result():
-            raise DoraSystemdError(
-                f"cannot use {options.dataflow}: {reason}",
-                f"see {options.dora} validate {options.dataflow}",
-                ExitCode.BAD_INPUT,
-            )
+            hint = f"see {options.dora} validate {options.dataflow}"
+            if f"{UNSET}: " in reason:  # at a prompt it may be set
+                hint = "set the variable by --env NAME=VALUE, or write ${NAME:-DEFAULT}"
+            message = f"cannot use {options.dataflow}: {reason}"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 
 
 def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> str:
@@ -85,7 +88,15 @@ def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> s
     if done.status == 0:
         return ""
     reason = refusal_reason(done)
+    if UNSET_OR_OTHER in reason and (names := _unset(options.dataflow, environment)):
+        return reason.replace(UNSET_OR_OTHER, f"{UNSET}: {', '.join(names)}")
     return name_input(reason, _document(options.dataflow)) if UNNAMED.search(reason) else reason
+
+
+def _unset(dataflow: str, environment: Mapping[str, str]) -> list[str]:
+    with contextlib.suppress(DoraSystemdError):
+        return unset_variables(parse_dataflow(_document(dataflow), dataflow), environment)
+    return []
 
 
 def _document(dataflow: str) -> object:

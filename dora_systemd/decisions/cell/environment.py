@@ -11,7 +11,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_readable
 from dora_systemd.paths import CellPaths
-from dora_systemd.values import format_bool, parse_bool, quoted, shown
+from dora_systemd.values import format_bool, parse_bool, quoted
 
 MAX_ENTRY = 128 * 1024 - 1
 """Maximum bytes of one `KEY=VALUE`: execve(2) refuses a longer one (MAX_ARG_STRLEN) with its NUL.
@@ -38,15 +38,21 @@ a NOTIFY_SOCKET from a flag the start job would wait forever."""
 _RESERVED = MANAGER_VARIABLES | {"CREDENTIALS_DIRECTORY"}
 """Variables that only systemd sets; nodes get the last one, to find their credentials."""
 
-# One word of an environment file: quoted parts, escaped and plain characters, in any order.
-_QUOTED = re.compile(r"""'(?P<single>[^']*)'|"(?P<double>(?:[^"\\]|\\.)*)"|\\(?P<char>.)""", re.S)
-
 
 def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """The runner's environment without the variables that systemd sets, with the lock file."""
     kept = {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
     directory = environment.get("RUNTIME_DIRECTORY")
     return {**kept, LOCK_VARIABLE: str(CellPaths(Path(directory)).lock)} if directory else kept
+
+
+def with_place(environment: Mapping[str, str], directory: str, home: str) -> dict[str, str]:
+    """The environment of nodes, with what it has at a prompt and systemd does not always set.
+
+    directory: where the nodes run, for PWD. home: of their user, which systemd leaves out if it is
+    /. Values that the environment has are kept.
+    """
+    return {"PWD": directory, **({"HOME": home} if home else {}), **environment}
 
 
 def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
@@ -91,25 +97,6 @@ def checked_variable(key: str, value: str) -> tuple[str, str]:
     return key, value
 
 
-def parse_environment_file(text: str, source: str) -> dict[str, str]:
-    """The variables of an environment file in the syntax of EnvironmentFile= in systemd.exec(5).
-
-    Comments begin with # or ;, values may be quoted, a backslash at the end of a line joins the
-    next one. `source` names the file in errors. Raises DoraSystemdError (BAD_INPUT).
-    """
-    variables: dict[str, str] = {}
-    for number, line in _logical_lines(text):
-        try:
-            key, equals, value = line.partition("=")
-            parse_assignment(key.strip() + equals + (unquoted := _unquoted(value.strip())))
-            variables[key.strip()] = unquoted
-        except DoraSystemdError as error:
-            # The line may contain a secret.
-            message = f"cannot read line {number} of {shown(source)} as KEY=VALUE"
-            raise DoraSystemdError(message, error.hint, ExitCode.BAD_INPUT) from error
-    return variables
-
-
 def unit_environment(
     search_path: str, venv: str | None, variables: Mapping[str, str]
 ) -> dict[str, str]:
@@ -137,38 +124,6 @@ def find_python(venv: str | None, search_path: str, exists: Callable[[str], bool
 def environment_entries(variables: Mapping[str, str]) -> tuple[str, ...]:
     """The variables as Environment= on D-Bus: a "KEY=VALUE" each."""
     return tuple(f"{key}={value}" for key, value in variables.items())
-
-
-def _logical_lines(text: str) -> list[tuple[int, str]]:
-    """Lines with their numbers, continued ones joined, without empty lines and comments."""
-    lines: list[tuple[int, str]] = []
-    joined = False
-    for number, line in enumerate(text.split("\n"), 1):
-        bare = line.strip()
-        if joined:
-            lines[-1] = (lines[-1][0], lines[-1][1] + bare)
-        elif bare and bare[0] not in "#;":
-            lines.append((number, bare))
-        else:
-            continue
-        joined = lines[-1][1].endswith("\\")
-        lines[-1] = (lines[-1][0], lines[-1][1].removesuffix("\\"))
-    return lines
-
-
-def _unquoted(value: str) -> str:
-    """`value` as a shell reads it: without quotes; a backslash makes the next character literal."""
-    if re.search("[\"']", _QUOTED.sub("", value)):
-        raise _refusal("", "a quote is not closed: a value is one line of text")
-
-    def plain(match: re.Match[str]) -> str:
-        if match["single"] is not None:
-            return match["single"]
-        if match["char"] is not None:
-            return match["char"]
-        return re.sub(r'\\(["\\$`])', r"\1", match["double"])
-
-    return _QUOTED.sub(plain, value)
 
 
 def _is_usable(entry: str) -> bool:

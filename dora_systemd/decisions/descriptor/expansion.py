@@ -65,6 +65,12 @@ def expanded(env: Mapping[str, object], environment: Mapping[str, str]) -> dict[
     }
 
 
+def unset_variables(dataflow: Dataflow, environment: Mapping[str, str]) -> list[str]:
+    """Return the variables that values of `env:` name, and that nothing gives a value."""
+    names = (name for text in _texts(dataflow) for name in _names(text, with_default=False))
+    return [name for name in dict.fromkeys(names) if name not in environment]
+
+
 def sent_again(node: Mapping[str, Any]) -> dict[str, Any]:
     """A node as the coordinator has it, for a request: it replaces variables in it once more."""
     env = node.get("env")
@@ -83,11 +89,12 @@ def _texts(dataflow: Dataflow) -> Iterator[str]:
         yield from (value for value in env.values() if isinstance(value, str))
 
 
-def _names(text: str) -> Iterator[str]:
+def _names(text: str, with_default: bool = True) -> Iterator[str]:
     whole, rest = _parts(text)
     for match in (*_REFERENCE.finditer(whole), *_WITHOUT_BRACE.finditer(rest)):
         found = match.groupdict()
-        if name := found["plain"] or found.get("name"):
+        name = found["plain"] or found.get("name")
+        if name and (with_default or found.get("default") is None):
             yield name
 
 

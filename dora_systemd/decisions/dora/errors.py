@@ -11,7 +11,8 @@ _OS_ERROR = re.compile(r"\(os error \d+\)$")
 _END = ("Location:", "Stack backtrace:", "Backtrace omitted", "Run with ")
 _CHOICES = re.compile(r"`([^`]*)`, expected one of ((?:`[^`]*`(?:, )?){6,})")
 _BAD_VALUE = re.compile(r"data did not match any variant of untagged enum EnvValue")
-_VALUE_REASON = "a value names a variable that is not set (see --env), or is a list or mapping"
+UNSET = "a value names a variable that is not set"
+UNSET_OR_OTHER = f"{UNSET} (see --env), or is a list or mapping"
 _MAX_LENGTH = 300
 
 
@@ -27,7 +28,7 @@ def parse_dora_error(stderr: str) -> str:
     usage = [line for line in lines if line.startswith("error: ")][:1]
     last = [line for line in lines if line][-1:]
     reason = _innermost(_after(lines, "Caused by:")) or " ".join(headline or usage or last)
-    return short_line(_BAD_VALUE.sub(_VALUE_REASON, _CHOICES.sub(_nearest, reason)), _MAX_LENGTH)
+    return short_line(_BAD_VALUE.sub(UNSET_OR_OTHER, _CHOICES.sub(_nearest, reason)), _MAX_LENGTH)
 
 
 def _nearest(choices: re.Match[str]) -> str:

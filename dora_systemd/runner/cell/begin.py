@@ -1,6 +1,8 @@
 """Starts a cell: its cgroup and its coordinator. Imports only what loads quickly."""
 
+import contextlib
 import os
+import pwd
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +10,7 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora import engine
-from dora_systemd.decisions.cell.environment import find_python
+from dora_systemd.decisions.cell.environment import find_python, node_environment, with_place
 from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.paths import CellPaths
@@ -43,6 +45,15 @@ def enter_supervisor() -> Path:
     cgroup.make_group(own / cgroup.SUPERVISOR)
     cgroup.move_process(own / cgroup.SUPERVISOR, 0)
     return own
+
+
+def nodes_environment(directory: str) -> dict[str, str]:
+    """The environment of nodes that run in `directory`."""
+    home = ""
+    if "HOME" not in os.environ:
+        with contextlib.suppress(KeyError):
+            home = pwd.getpwuid(os.getuid()).pw_dir
+    return node_environment(with_place(os.environ, directory, home))
 
 
 def make_lock(path: Path) -> None:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.dora.preparation import Prepared, check_named_nodes
 from dora_systemd.adapters.host.files import decoded, parse_yaml, read_text
-from dora_systemd.decisions.cell.environment import parse_environment_file, unit_environment
+from dora_systemd.decisions.cell.environment import unit_environment
+from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions

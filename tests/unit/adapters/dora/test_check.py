@@ -42,6 +42,20 @@ def test_a_member_leaves_to_the_head_what_is_the_same_there(options: RunnerOptio
     assert not Path(f"{options.dora}.asked").exists()
 
 
+def test_a_variable_that_is_not_set_is_named(options: RunnerOptions) -> None:
+    """It may be set where somebody runs dora validate."""
+    text = "data did not match any variant of untagged enum EnvValue at line 1"
+    script = f'#!/bin/sh\necho "[ERROR]" >&2\necho "{text}" >&2\nexit 1\n'
+    Path(options.dora).write_text(script)
+    Path(options.dataflow).write_text("nodes: [{id: a, path: a.py, env: {A: '${LIB}/$PWD'}}]")
+    check = DoraCheck(options, {"PWD": "/srv", "PATH": os.environ["PATH"]}, lambda: True)
+    with pytest.raises(
+        DoraSystemdError, match=r"a variable that is not set: LIB at line 1"
+    ) as caught:
+        check.result()
+    assert caught.value.hint.startswith("set the variable by --env")
+
+
 @pytest.mark.parametrize("is_ours_refused", [False, True])
 def test_what_dora_refuses_comes_before_what_we_refuse(
     options: RunnerOptions, is_ours_refused: bool

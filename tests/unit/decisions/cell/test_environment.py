@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 from dora_systemd.decisions.cell.environment import (
     environment_entries,
     parse_assignment,
-    parse_environment_file,
     unit_environment,
+    with_place,
 )
+from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 keys = st.from_regex(r"X_[A-Z0-9_]{0,10}", fullmatch=True)
@@ -72,12 +73,34 @@ A=3
     assert parse_environment_file(text, "x.env") == {
         "A": "3",
         "B": "2",
-        "C": "a b c d",
+        "C": "a bcd",
         "D": "ab",
         "E": '$HOME "x"',
         "F": 'say "hi" $x \\n',
         "G": "",
     }
+
+
+@pytest.mark.parametrize(
+    ("line", "value"),
+    [
+        ('{"a": 1}', '{"a": 1}'),
+        ("it's", "it's"),
+        ("5'10\"", "5'10\""),
+        ('"x y" z', "x yz"),
+        (r"a\ b", "a b"),
+        ("x\\ ", "x "),
+        ("  sp  ", "sp"),
+        (r'"a\$b\n"', r"a$b\n"),
+        ('a"b c"d', 'a"b c"d'),
+        ("a\\\n b", "a b"),
+        ('"a\\\nb"', "ab"),
+        ("last\\", "last"),
+    ],
+)
+def test_values_as_systemd_reads_them(line: str, value: str) -> None:
+    """Compared with EnvironmentFile= of systemd 257."""
+    assert parse_environment_file(f"# a \\\nA={line}", "x.env") == {"A": value}
 
 
 def test_a_bad_line_is_named_and_not_shown() -> None:
@@ -100,6 +123,12 @@ def test_any_file_is_read_or_refused(text: str) -> None:
         return
     for entry in environment_entries(variables):
         parse_assignment(entry)
+
+
+def test_what_a_prompt_has_and_systemd_does_not_set() -> None:
+    given = {"A": "1", "PWD": "/given"}
+    assert with_place(given, "/srv", "/") == {"A": "1", "PWD": "/given", "HOME": "/"}
+    assert with_place({"HOME": "/home/a"}, "/srv", "") == {"HOME": "/home/a", "PWD": "/srv"}
 
 
 def test_the_environment_of_a_unit() -> None:

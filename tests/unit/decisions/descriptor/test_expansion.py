@@ -3,7 +3,12 @@
 import pytest
 
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.decisions.descriptor.expansion import called_variables, expanded, sent_again
+from dora_systemd.decisions.descriptor.expansion import (
+    called_variables,
+    expanded,
+    sent_again,
+    unset_variables,
+)
 
 
 def test_what_is_named_and_set() -> None:
@@ -19,6 +24,12 @@ def test_what_is_named_and_set() -> None:
     caller = dict.fromkeys(("MODEL", "KEY", "_k", "HOME", "PRICE", "WITH", "ARGS", "OTHER"), "v")
     assert called_variables(dataflow, caller) == dict.fromkeys(("KEY", "_k", "WITH", "MODEL"), "v")
     assert called_variables(dataflow, {"RUST_LOG": "debug"}) == {"RUST_LOG": "debug"}
+
+
+def test_what_is_named_and_not_set() -> None:
+    node = {"id": "a", "path": "a.py", "env": {"M": "${MODEL}/${LIB:-lib}/$PWD", "N": 5}}
+    dataflow = parse_dataflow({"nodes": [node], "env": {"K": "$KEY $KEY"}}, "f")
+    assert unset_variables(dataflow, {"PWD": "/srv"}) == ["KEY", "MODEL"]
 
 
 @pytest.mark.parametrize(
