@@ -43,9 +43,18 @@ def written_us(path: Path) -> int:
 def write_link(path: Path, target: str) -> None:
     """Create the symbolic link `path` unless it exists. Raises DoraSystemdError."""
     with _told("write", path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_parents(path)
         if not path.is_symlink():
             path.symlink_to(target)
+
+
+def _make_parents(path: Path) -> list[Path]:
+    """Create the missing directories of `path`, which all may read whatever the umask is."""
+    made = [one for one in path.parents if not one.exists()]
+    for directory in reversed(made):
+        directory.mkdir(0o755, exist_ok=True)
+        directory.chmod(0o755)
+    return made
 
 
 def remove_empty(directory: Path) -> None:
@@ -60,10 +69,7 @@ def write_unit_file(path: Path, text: str) -> None:
     Raises DoraSystemdError; then `path` is unchanged, unless the disk is broken.
     """
     with _told("write", path):
-        made = [one for one in path.parents if not one.exists()]
-        for directory in reversed(made):  # whatever the umask is, all may read units
-            directory.mkdir(0o755, exist_ok=True)
-            directory.chmod(0o755)
+        made = _make_parents(path)
         write_atomic(path, text, is_durable=True)
         # The content is on the disk by now; syncing the directories makes the names durable.
         for directory in (path.parent, *(one.parent for one in made)):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.host.unit_files import write_unit_file
+from dora_systemd.adapters.host.unit_files import write_link, write_unit_file
 from dora_systemd.adapters.releases.store import make_directories
 from dora_systemd.errors import DoraSystemdError
 
@@ -51,8 +51,9 @@ def test_no_umask_lets_others_write_or_keeps_them_from_reading(tmp_path: Path, u
             patch.setattr(Path, "mkdir", note)
             write_unit_file(tmp_path / "a/b/dora-robot.service", "[Service]\n")
             make_directories(tmp_path / "c/d")
+            write_link(tmp_path / "e/f.target.wants/dora.target", "../dora.target")
     finally:
         os.umask(before)
-    assert modes == [0o755 & ~umask] * 4, "as they were made"
-    for place in ("a", "a/b", "c", "c/d"):
+    assert modes == [0o755 & ~umask] * 6, "as they were made"
+    for place in ("a", "a/b", "c", "c/d", "e", "e/f.target.wants"):
         assert (tmp_path / place).stat().st_mode & 0o777 == 0o755
