@@ -236,7 +236,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         wait_for_needs(run, own, reloader.definition, dialogue.spawn)
         dialogue.spawn("end with the last node", end_held(run))
         dialogue.spawn("tell that it has started", tell_started(run, reloader.has_started))
-        begin_watch(run, prepared.plan, dora, dialogue)
+        begin_watch(run, prepared, dora, dialogue)
         runs.beside.attach(pump.push)
         try:
             await pump.end

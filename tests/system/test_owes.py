@@ -120,6 +120,33 @@ def test_warn_only_tells(cell: Cell, project: Project) -> None:
     assert "camera" not in cell.show("StatusText")
 
 
+TICK = CAMERA.replace("image", "t")
+FED = """
+nodes:
+  - {id: tick, path: tick.py, inputs: {tick: dora/timer/millis/20}, outputs: [t]}
+  - {id: camera, path: camera.py, inputs: {tick: tick/t}, outputs: [image]}
+"""
+
+
+@pytest.mark.warns("is silent")
+def test_a_starved_node_is_not_restarted(cell: Cell, project: Project) -> None:
+    """The node that it gets nothing from is named, and nobody's restarts are used up."""
+    project.write("tick.py", TICK)
+    path = flow(project, "{output: image, within: 1s}")
+    path.write_text(FED)
+    cell.start(path)
+    wait_for("it is heard", lambda: camera_of(cell)["outputs"][0]["age_us"] is not None)
+    (tick,) = cell.pids("node-tick")
+    os.kill(tick, signal.SIGSTOP)
+    words = "no image for 1s, starved of tick/t"
+    wait_for("it is starved", lambda: camera_of(cell)["silent"] == words)
+    why = cell.doractl("why", cell.name, check=False).stdout
+    assert f"node tick: sends nothing; camera: {words}" in why
+    os.kill(tick, signal.SIGCONT)
+    wait_for("it speaks again", lambda: has(cell, "node-speaks-again"))
+    assert (camera_of(cell)["silent"], camera_of(cell)["restarts"]) == (None, 0)
+
+
 @pytest.mark.warns("is silent", "failed: node camera", "Failed with result", "status=1")
 def test_fail_ends_the_dataflow_by_its_policy(cell: Cell, project: Project) -> None:
     path = flow(project, "{output: image, within: 500ms, then: fail}")

@@ -17,6 +17,8 @@ decisions/owes/probe.py."""
 
 RESTART, WARN, FAIL = "restart", "warn", "fail"
 THEN = (RESTART, WARN, FAIL)
+STARVED = ", starved of "
+"""Before the input, NODE/OUTPUT, that a silent node lacks; `why` reads it."""
 KEYS = ("output", "within", "first", "then")
 
 SHORTEST = SECOND // 5

@@ -5,12 +5,15 @@ its start. Time counts only as far as all have run who could have noticed a mess
 for each look, and nothing while the probe does not note its beat. So none of these is a silence of
 a node: a suspended machine, a cell that a signal or the freezer has stopped, a clock that was set,
 a runner or a probe that gets no CPU time.
+
+A silent node whose own inputs are silent is starved, see feeds.py: its process is not at fault.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owed import STARVED, Owed
+from dora_systemd.decisions.owes.feeds import NO_FEEDS, Feeds, Flow, starved_of
 from dora_systemd.values import SECOND, format_duration
 
 _LOOKS = 8
@@ -27,7 +30,7 @@ BEATS = 2
 class Look:
     """What is known at one moment. at_us, beat_us, heard: CLOCK_MONOTONIC, 0 is never.
 
-    beat_us: the last beat of the probe. heard: the last message of each owed output. lives: by
+    beat_us: the last beat of the probe. heard: the last message of each slot of Feeds. lives: by
     node that runs, when its process became ready. probe: the number of the one that has noted the
     beat.
     """
@@ -46,7 +49,8 @@ class Ear:
     life: when the process that owes it became ready, 0 if none runs. heard: the last message.
     has_come: whether this process has sent one. quiet: time that counts, without a message.
     is_judged: this silence has been reported. is_silent: no message has come since a silence was
-    reported. silent_us: when that was.
+    reported. silent_us: when that was. flows: the inputs of the node. starved: the one of them,
+    NODE/OUTPUT, that the silence comes from, or "".
     """
 
     life: int = 0
@@ -56,28 +60,35 @@ class Ear:
     is_judged: bool = False
     is_silent: bool = False
     silent_us: int = 0
+    flows: tuple[Flow, ...] = ()
+    starved: str = ""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A node has fallen silent, or it speaks again. words: such as "no image for 2s"."""
+    """A node has fallen silent, or it speaks again. words: such as "no image for 2s".
+
+    is_starved: the node is silent because it gets nothing.
+    """
 
     owed: Owed
     is_silent: bool
     words: str
+    is_starved: bool = False
 
 
 @dataclass(frozen=True)
 class Judge:
     """The state of the watch over `owes`. at_us: the last look, 0 before the first.
 
-    probe: the one that was heard at the last look.
+    probe: the one that was heard at the last look. feeds: what the nodes get.
     """
 
     owes: tuple[Owed, ...]
     ears: tuple[Ear, ...] = ()
     at_us: int = 0
     probe: int = 0
+    feeds: Feeds = NO_FEEDS
 
     @property
     def tick(self) -> int:
@@ -95,9 +106,10 @@ class Judge:
 
 def silence(owed: Owed, ear: Ear) -> str:
     """What is missing, for people. It says the time that was allowed, so it stays the same."""
+    why = f"{STARVED}{ear.starved}" if ear.starved else ""
     if ear.has_come:
-        return f"no {owed.output} for {format_duration(owed.within)}"
-    return f"no {owed.output} within {format_duration(owed.first)} of its start"
+        return f"no {owed.output} for {format_duration(owed.within)}{why}"
+    return f"no {owed.output} within {format_duration(owed.first)} of its start{why}"
 
 
 def look(judge: Judge, now: Look) -> tuple[Judge, tuple[Verdict, ...]]:
@@ -107,39 +119,69 @@ def look(judge: Judge, now: Look) -> tuple[Judge, tuple[Verdict, ...]]:
         step = 0
     before = judge.ears or (Ear(),) * len(judge.owes)
     if now.probe != judge.probe:  # nobody heard what came between two probes
-        step, before = 0, tuple(replace(ear, quiet=0) for ear in before)
+        step, before = 0, tuple(map(_unheard, before))
     ears: list[Ear] = []
     verdicts: list[Verdict] = []
-    for owed, ear, heard in zip(judge.owes, before, now.heard, strict=True):
-        after = _judged(owed, _listen(ear, now.lives.get(owed.node, 0), heard, step), now.at_us)
+    for owed, ear, heard in zip(judge.owes, before, now.heard, strict=False):
+        fed = _fed(judge.feeds, owed, ear, now.heard, step)
+        after = _listen(fed, now.lives.get(owed.node, 0), heard, step)
+        after = _judged(owed, after, now.at_us, judge)
         verdicts += _verdicts(owed, ear, after, now.at_us)
         ears.append(after)
     return replace(judge, ears=tuple(ears), at_us=now.at_us, probe=now.probe), tuple(verdicts)
 
 
+def _unheard(ear: Ear) -> Ear:
+    return replace(ear, quiet=0, flows=tuple(replace(one, quiet=0) for one in ear.flows))
+
+
+def _fed(feeds: Feeds, owed: Owed, ear: Ear, heard: Sequence[int], step: int) -> Ear:
+    """The ear after a look at the inputs of its node.
+
+    When a starved node gets its input again, the time to answer begins.
+    """
+    slots = feeds.by_node.get(owed.node, ())
+    known = ear.flows or (Flow(),) * len(slots)
+    flows = tuple(
+        flow.after(heard[slot], step, owed.within) for flow, slot in zip(known, slots, strict=True)
+    )
+    fresh = {feeds.places[slot] for flow, slot in zip(flows, slots, strict=True) if not flow.quiet}
+    if ear.starved in fresh:
+        ear = replace(ear, starved="", is_judged=False, quiet=0)
+    return replace(ear, flows=flows)
+
+
 def _listen(ear: Ear, life: int, heard: int, step: int) -> Ear:
     if life != ear.life:  # another process, or none
-        ear = replace(ear, life=life, has_come=False, quiet=-step, is_judged=False)
+        ear = replace(ear, life=life, has_come=False, quiet=-step, is_judged=False, starved="")
         is_new = life > 0 and heard > max(life - _EARLY, 0)
     else:
         is_new = life > 0 and heard > ear.heard
     if is_new:
-        fresh = replace(ear, has_come=True, quiet=0, is_judged=False, is_silent=False)
+        fresh = replace(ear, has_come=True, quiet=0, is_judged=False, is_silent=False, starved="")
         return replace(fresh, heard=heard)
     return replace(ear, heard=max(heard, ear.heard), quiet=ear.quiet + step if life else 0)
 
 
-def _judged(owed: Owed, ear: Ear, at_us: int) -> Ear:
+def _judged(owed: Owed, ear: Ear, at_us: int, judge: Judge) -> Ear:
     allowed = owed.within if ear.has_come else owed.first
     if not ear.life or ear.is_judged or ear.quiet <= allowed:
         return ear
     since_us = ear.silent_us if ear.is_silent else at_us
-    return replace(ear, is_judged=True, is_silent=True, silent_us=since_us)
+    starved = _starved(owed, ear, judge)
+    return replace(ear, is_judged=True, is_silent=True, silent_us=since_us, starved=starved)
+
+
+def _starved(owed: Owed, ear: Ear, judge: Judge) -> str:
+    """The input, NODE/OUTPUT, that a silent node lacks, or ""."""
+    is_whole = owed.node in judge.feeds.whole
+    at = starved_of(ear.flows, ear.quiet, judge.tick, owed, not ear.has_come, is_whole)
+    return "" if at is None else judge.feeds.places[judge.feeds.by_node[owed.node][at]]
 
 
 def _verdicts(owed: Owed, before: Ear, after: Ear, at_us: int) -> Iterator[Verdict]:
     if after.is_judged and not (before.is_judged and before.life == after.life):
-        yield Verdict(owed, True, silence(owed, after))
+        yield Verdict(owed, True, silence(owed, after), bool(after.starved))
     if before.is_silent and not after.is_silent:
         lasted = (at_us - before.silent_us) // SECOND * SECOND
         words = f"{owed.output} again" + (f" after {format_duration(lasted)}" if lasted else "")

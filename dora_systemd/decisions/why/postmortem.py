@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
 from dora_systemd.decisions.cell.machines import HEAD
+from dora_systemd.decisions.cell.owed import STARVED
 from dora_systemd.decisions.life.causes import ESSENTIAL, NO_END, UNIT_RESULTS, Cause, result_words
 from dora_systemd.decisions.life.setup_exits import setup_failure
 from dora_systemd.decisions.logs.events import NODE_END_EVENTS
@@ -113,6 +114,11 @@ def _present(life: Life, facts: Facts) -> Verdict:
     for node, missing in facts.silent.items():
         said = [one for one in life.all("node-silent") if one.node == node]
         at = said[-1] if said else None
+        _, is_starved, source = missing.rpartition(STARVED)
+        if is_starved:  # who sends nothing to it is to blame
+            origin = source.partition("/")[0]
+            words = f"node {origin}: sends nothing; {node}: {missing}"
+            return _found(Cause.NODE_SILENT, words, at, origin)
         return _found(Cause.NODE_SILENT, f"node {node}: {missing}", at, node)
     return _found(Cause.NONE, "")
 

@@ -3,15 +3,15 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dora_systemd.decisions.cell.launch import LaunchPlan
+    from dora_systemd.adapters.dora.preparation import Prepared
     from dora_systemd.runner.cell.engine import Engine
     from dora_systemd.runner.cell.failure import Tasks
     from dora_systemd.runner.reload.apply import Run
 
 
-def begin_watch(run: "Run", plan: "LaunchPlan", dora: "Engine", dialogue: "Tasks") -> None:
-    """Watch the outputs that the options of `plan` name, if any, until the run ends."""
-    if plan.options.owes:
+def begin_watch(run: "Run", prepared: "Prepared", dora: "Engine", dialogue: "Tasks") -> None:
+    """Watch the outputs that the options of `prepared` name, if any, until the run ends."""
+    if prepared.plan.options.owes:
         from dora_systemd.runner.owes.watch import watch_owes
 
-        dialogue.spawn("watch what nodes owe", watch_owes(run, plan, dora, dialogue))
+        dialogue.spawn("watch what nodes owe", watch_owes(run, prepared, dora, dialogue))

@@ -6,10 +6,11 @@ from typing import Any
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.preparation import PACKAGE
 from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
-from dora_systemd.decisions.cell.owed import PROBE, Owed
+from dora_systemd.decisions.cell.owed import PROBE
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.owes.feeds import Feeds
 from dora_systemd.decisions.owes.probe import probe_definition
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
@@ -30,18 +31,26 @@ _TRIES = 2
 
 
 class Probe:
-    """The probe of one run. plan: of the dataflow. tick: µs between two calls of tend().
+    """The probe of one run. plan: of the dataflow. feeds: what to hear.
 
-    find_python: the interpreter with dora-rs; raises DoraSystemdError if there is none.
+    tick: µs between two calls of tend(). find_python: the interpreter with dora-rs; raises
+    DoraSystemdError if there is none.
     """
 
     def __init__(
-        self, run: Run, dora: Engine, plan: LaunchPlan, tick: int, find_python: FindPython
+        self,
+        run: Run,
+        dora: Engine,
+        plan: LaunchPlan,
+        feeds: Feeds,
+        tick: int,
+        find_python: FindPython,
     ) -> None:
         unit, paths = run.nodes.places
         self._run = run
         self._engine = dora
         self._plan = plan
+        self._feeds = feeds
         self._find_python = find_python
         self._tick = tick
         self._path = paths.times
@@ -78,11 +87,16 @@ class Probe:
             self._number = self._count
         return self._number, beat if is_own and cgroup.is_populated(self._group) else 0
 
-    def _inputs(self) -> list[tuple[int, Owed]]:
-        """The owed outputs of nodes that have not ended for good, each with its place."""
-        nodes = self._run.pump.cell.nodes
-        owes = enumerate(self._plan.options.owes)
-        return [(at, one) for at, one in owes if _can_come(nodes.get(one.node))]
+    def _inputs(self) -> list[tuple[int, str]]:
+        """The outputs of nodes that have not ended for good, each with its slot.
+
+        None if all nodes that owe something have ended.
+        """
+        nodes, owes = self._run.pump.cell.nodes, self._plan.options.owes
+        if not any(_can_come(nodes.get(one.node)) for one in owes):
+            return []
+        slots = enumerate(self._feeds.places)
+        return [(at, one) for at, one in slots if _can_come(nodes.get(one.partition("/")[0]))]
 
     def _check(self, is_needed: bool, beat: int, now: int) -> None:
         """Kill a probe that hangs: the dataflow would not finish without it."""
@@ -96,7 +110,7 @@ class Probe:
         elif is_well and now > self._next_us + _LATE:
             self._pause, self._is_told = _SOON, False
 
-    async def _add(self, inputs: list[tuple[int, Owed]]) -> None:
+    async def _add(self, inputs: list[tuple[int, str]]) -> None:
         try:
             python = await self._find_python()
             cgroup.make_group(self._group)
@@ -110,7 +124,7 @@ class Probe:
         except OSError as error:
             self._tell(f"its group: {error.strerror}")
 
-    def _define(self, python: str, inputs: list[tuple[int, Owed]]) -> dict[str, Any]:
+    def _define(self, python: str, inputs: list[tuple[int, str]]) -> dict[str, Any]:
         script, seconds = PACKAGE / "runner" / "owes" / "listen.py", self._tick / SECOND / 2
         command = [python, "-u", str(script), str(self._path), f"{seconds:g}"]
         self._count += 1

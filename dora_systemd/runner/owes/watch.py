@@ -8,15 +8,16 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 
+from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.dora.probe import probe_python
 from dora_systemd.adapters.host.shared_times import SharedTimes
-from dora_systemd.decisions.cell.launch import LaunchPlan
 from dora_systemd.decisions.cell.owed import RESTART, WARN
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.decisions.owes.feeds import find_feeds
 from dora_systemd.decisions.owes.judge import Judge, Look, Verdict, look
 from dora_systemd.decisions.owes.probe import parse_times, size_of_times
 from dora_systemd.errors import DoraSystemdError
@@ -32,12 +33,12 @@ _LONGEST_GRACE = SECOND
 """A node that hangs does not stop by itself, and what it owes is late already."""
 
 
-async def watch_owes(run: Run, plan: LaunchPlan, dora: Engine, dialogue: Tasks) -> None:
-    """Watch the outputs that the options of `plan` name, from the start of all nodes on."""
+async def watch_owes(run: Run, prepared: Prepared, dora: Engine, dialogue: Tasks) -> None:
+    """Watch the outputs that the options of `prepared` name, from the start of all nodes on."""
     await run.pump.wait(lambda cell: cell.state is State.RUNNING, None)
-    find_python = partial(asyncio.to_thread, probe_python, plan)
+    find_python = partial(asyncio.to_thread, probe_python, prepared.plan)
     try:
-        watch = Watch(run, plan, dora, dialogue, find_python)
+        watch = Watch(run, prepared, dora, dialogue, find_python)
     except OSError as error:  # such as a full file system: the nodes run, and need not end for it
         run.pipes.write_event("outputs-unwatched", reason=f"the file of times: {error.strerror}")
         return
@@ -49,15 +50,17 @@ class Watch:
     """The watch over one run of a dataflow. find_python: see Probe."""
 
     def __init__(
-        self, run: Run, plan: LaunchPlan, dora: Engine, dialogue: Tasks, find_python: FindPython
+        self, run: Run, prepared: Prepared, dora: Engine, dialogue: Tasks, find_python: FindPython
     ) -> None:
+        plan = prepared.plan
         self._run = run
         self._engine = dora
         self._dialogue = dialogue
-        self._judge = Judge(plan.options.owes)
-        size = size_of_times(plan.options.owes)
+        feeds = find_feeds(plan.options.owes, prepared.dataflow, self._is_here)
+        self._judge = Judge(plan.options.owes, feeds=feeds)
+        size = size_of_times(len(feeds.places))
         self._times = SharedTimes(run.nodes.places[1].times, size)
-        self._probe = Probe(run, dora, plan, self._judge.tick, find_python)
+        self._probe = Probe(run, dora, plan, feeds, self._judge.tick, find_python)
         self._ready: dict[str, tuple[int, int]] = {}
 
     async def work(self) -> None:
@@ -66,11 +69,14 @@ class Watch:
         while True:
             # CLOCK_MONOTONIC: it stands while the machine is suspended, and nobody sets it.
             now = int(loop.time() * SECOND)
-            beat, heard = parse_times(self._times.read(), self._judge.owes, now)
+            beat, heard = parse_times(self._times.read(), len(self._judge.feeds.places), now)
             number, fresh = self._probe.heard(beat)
             self._look(Look(now, fresh, heard, self._lives(now), number))
             await self._probe.tend(beat, now)
             await asyncio.sleep(self._judge.tick / SECOND)
+
+    def _is_here(self, node: str) -> bool:
+        return not self._run.pump.cell.nodes.get(node, NodeStatus()).machine
 
     def close(self) -> None:
         """Forget the file of times."""
@@ -107,9 +113,11 @@ class Watch:
             speaks = life.NodeSpeaks(now_us(), owed.node, owed.output, words, left)
             self._run.pump.push(speaks)
             return
-        silent = life.NodeSilent(now_us(), owed.node, owed.output, words, owed.then, left)
+        # A restart does not help a node that gets nothing, and uses up its budget.
+        then = WARN if verdict.is_starved and owed.then == RESTART else owed.then
+        silent = life.NodeSilent(now_us(), owed.node, owed.output, words, then, left)
         self._run.pump.push(silent)
-        if owed.then == RESTART:
+        if then == RESTART:
             self._dialogue.spawn(f"restart the node {owed.node}", self._restart(silent))
 
     async def _restart(self, silent: life.NodeSilent) -> None:

@@ -115,10 +115,11 @@ def read_heard(scope: Scope, name: str, owes: "Sequence[Owed]") -> tuple[int, ..
     """The last message of each owed output of a dataflow, CLOCK_MONOTONIC µs, 0 is never."""
     if not owes:
         return ()
+    from dora_systemd.decisions.owes.feeds import MOST_FEEDS
     from dora_systemd.decisions.owes.probe import parse_times, size_of_times
 
-    data = read_times(scope.cell_directory(name), size_of_times(owes))
-    return parse_times(data, owes, _monotonic_us())[1]
+    data = read_times(scope.cell_directory(name), size_of_times(len(owes) + MOST_FEEDS))
+    return parse_times(data, len(owes), _monotonic_us())[1]
 
 
 def _known(cell: Cell, status: CellStatus, is_row: bool) -> dict[str, Any]:

@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.owes.feeds import Feeds, find_feeds
 from dora_systemd.decisions.owes.judge import Judge, Look, Verdict, look
 from dora_systemd.values import SECOND
 
@@ -41,6 +43,8 @@ class World:
         self.has_probe = True
         self.probe = 1
         self.restarted: list[int] = []
+        self.fed: Callable[[int], bool] | None = None
+        self.last_fed = 0
 
     def run(self, duration: int, late: int = 0) -> "World":
         """Everything runs; the judge looks at each tick, and `late` µs after it."""
@@ -66,10 +70,15 @@ class World:
     def look(self) -> None:
         lives = {"camera": self.life} if self.now >= self.life else {}
         beat = self.beat if self.has_probe else 0
-        now = Look(self.now, beat, (self.heard,), lives, self.probe)
+        if self.fed and self.has_probe and self.fed(self.now):
+            self.last_fed = self.now
+        heard = (self.heard, self.last_fed) if self.fed else (self.heard,)
+        now = Look(self.now, beat, heard, lives, self.probe)
         self.judge, found = look(self.judge, now)
         self.verdicts += found
-        if any(one.is_silent and one.owed.then == "restart" for one in found):
+        if any(
+            one.is_silent and not one.is_starved and one.owed.then == "restart" for one in found
+        ):
             self.restarted.append(self.now)
             self.life = self.now + self.restart_us
 
@@ -229,3 +238,80 @@ def test_nobody_is_silent_for_what_came_between_two_probes(gap: int) -> None:
     assert not world.verdicts
     world.speaks = never
     assert world.run(3 * SECOND).words() == ["no image for 2s"]
+
+
+def fed_world(is_whole: bool = True) -> World:
+    """A camera that sends an image for each message of `tick`, while it is well."""
+    world = World()
+    whole = frozenset({"camera"}) if is_whole else frozenset()
+    feeds = Feeds(("camera/image", "tick/t"), {"camera": (1,)}, whole)
+    world.judge = Judge((CAMERA,), feeds=feeds)
+    world.fed = always
+    return world
+
+
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_starved_node_is_not_restarted(is_whole: bool) -> None:
+    world = fed_world(is_whole).run(60 * SECOND)
+    world.fed = world.speaks = never
+    world.run(HOUR)
+    assert world.words() == ["no image for 2s, starved of tick/t"]
+    assert (world.verdicts[0].is_starved, world.restarted) == (True, [])
+    # It gets its input again: now it owes an image.
+    world.fed = always
+    world.run(SECOND)
+    assert not world.restarted
+    world.run(2 * SECOND)
+    assert world.words()[1:] == ["no image for 2s"]
+    assert world.restarted
+    world.speaks = always
+    world.run(3 * SECOND)
+    assert world.words()[-1].startswith("image again")
+
+
+def test_a_node_that_hangs_while_it_is_fed_is_restarted() -> None:
+    world = fed_world().run(60 * SECOND)
+    world.speaks = never
+    world.run(3 * SECOND)
+    assert world.words() == ["no image for 2s"]
+    assert world.restarted
+
+
+def test_an_input_that_ended_long_before_is_no_excuse() -> None:
+    """Such as a joystick that nobody moves, beside a timer."""
+    world = fed_world(is_whole=False).run(60 * SECOND)
+    world.fed = never
+    world.run(60 * SECOND)
+    assert not world.verdicts
+    world.speaks = never
+    world.run(3 * SECOND)
+    assert (world.words(), len(world.restarted)) == (["no image for 2s"], 1)
+
+
+def test_a_node_that_was_never_fed_is_starved() -> None:
+    world = fed_world()
+    world.fed = world.speaks = never
+    world.run(60 * SECOND)
+    assert world.words() == ["no image within 30s of its start, starved of tick/t"]
+    assert not world.restarted
+
+
+def test_which_inputs_are_heard() -> None:
+    nodes = [
+        {"id": "tick", "path": "a", "outputs": ["t"], "inputs": {"x": "dora/timer/millis/9"}},
+        {"id": "far", "path": "a", "outputs": ["t"]},
+        {"id": "camera", "path": "a", "outputs": ["image"], "inputs": {"t": "tick/t"}},
+        {
+            "id": "plan",
+            "path": "a",
+            "outputs": ["p"],
+            "inputs": {"i": "camera/image", "m": "move/m"},
+        },
+        {"id": "move", "path": "a", "outputs": ["m"], "inputs": {"p": "plan/p", "far": "far/t"}},
+    ]
+    dataflow = parse_dataflow({"nodes": nodes}, "x.yml")
+    owes = tuple(Owed(node, out, SECOND) for node, out in (("camera", "image"), ("plan", "p")))
+    feeds = find_feeds((*owes, Owed("move", "m", SECOND)), dataflow, lambda node: node != "far")
+    assert feeds.places == ("camera/image", "plan/p", "move/m", "tick/t")
+    assert feeds.by_node == {"camera": (3,), "plan": (0,), "move": ()}  # plan and move: a circle
+    assert feeds.whole == {"camera"}

@@ -145,7 +145,7 @@ def test_a_silent_node_has_a_policy(then: str, policy: str | None) -> None:
 
 
 def test_the_probe_is_a_node_of_its_own() -> None:
-    inputs = [(3, CAMERA)]
+    inputs = [(3, CAMERA.place)]
     node = probe_definition(7, ["python", "probe.py"], ("/usr/bin/perl", "/l.pl"), inputs)
     assert is_probe(node["id"])
     assert node["inputs"] == {"3": {"source": "camera/image", "queue_size": 1}}
@@ -153,12 +153,12 @@ def test_the_probe_is_a_node_of_its_own() -> None:
 
 
 def test_times_of_a_hostile_file() -> None:
-    two = (CAMERA, CAMERA)
     now = 50 * SECOND
-    assert parse_times(struct.pack("=3Q", 7, 8, 0), two, now) == (7, (8, 0))
-    assert parse_times(struct.pack("=3Q", 2**64 - 1, now * 2, 5), two, now) == (0, (0, 5))
-    for data in (b"", b"x", bytes(size_of_times(two) + 8)):
-        assert parse_times(data, two, now) == (0, (0, 0))
+    assert parse_times(struct.pack("=3Q", 7, 8, 0), 2, now) == (7, (8, 0))
+    assert parse_times(struct.pack("=4Q", 7, 8, 0, 9), 2, now) == (7, (8, 0))
+    assert parse_times(struct.pack("=3Q", 2**64 - 1, now * 2, 5), 2, now) == (0, (0, 5))
+    for data in (b"", b"x", bytes(size_of_times(2) - 8), bytes(size_of_times(2) + 1)):
+        assert parse_times(data, 2, now) == (0, (0, 0))
 
 
 def test_the_budget_of_a_node_that_only_owes_is_its_own() -> None:

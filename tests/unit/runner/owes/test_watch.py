@@ -3,6 +3,7 @@
 import asyncio
 import struct
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +56,9 @@ class Bench(ReloadBench):
         self.owing = OwingNodes(self.calls, root)
         self.run = Run(self.pump, self.owing, self.pipes, Swapper(self.pump, self.dora))
         options = self.options._replace(owes=owes or (OWED,))
-        plan = self.prepared.plan
         self.python = "/venv/bin/python"
-        changed = type(plan)(**{**vars(plan), "options": options})
+        plan = replace(self.prepared.plan, options=options)
+        changed = replace(self.prepared, plan=plan)
         self.tasks = Spawned()
         self.watch = Watch(self.run, changed, self.dora, self.tasks, self.find_python)
         self.group = root / f"node-{PROBE}"

@@ -1,0 +1,93 @@
+"""What nodes that owe something get from other nodes: without that they are starved. Pure."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.descriptor.wiring import downstream_of
+
+MOST_FEEDS = 64
+"""Maximum inputs that are watched, besides owed outputs."""
+_REGULAR = 4
+"""Times `within` after which an input without a gap counts as regular."""
+
+
+@dataclass(frozen=True)
+class Feeds:
+    """The inputs of owing nodes that the probe hears.
+
+    places: NODE/OUTPUT of each slot in the file of times: the owed outputs, then the others.
+    by_node: the slots of the inputs of each owing node. whole: the nodes of which every input is
+    heard: none is a timer, or comes from another machine.
+    """
+
+    places: tuple[str, ...] = ()
+    by_node: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    whole: frozenset[str] = frozenset()
+
+
+NO_FEEDS = Feeds()
+
+
+@dataclass(frozen=True)
+class Flow:
+    """What is known of one input. Times in µs.
+
+    heard: its last message, CLOCK_MONOTONIC. steady: how long messages came without a gap longer
+    than `within`. quiet: time that counts since the last message.
+    """
+
+    heard: int = 0
+    steady: int = 0
+    quiet: int = 0
+
+    def after(self, heard: int, step: int, within: int) -> "Flow":
+        """The flow after a look. step: µs that count."""
+        quiet = self.quiet + step
+        if heard > self.heard:
+            return Flow(heard, 0 if quiet > within else self.steady + quiet)
+        return replace(self, quiet=quiet)
+
+
+def find_feeds(owes: Sequence[Owed], dataflow: Dataflow, is_here: Callable[[str], bool]) -> Feeds:
+    """The feeds of the nodes in `owes`. is_here: whether this machine runs that node.
+
+    A message from another machine would take the network once more. In a circle the input of a node
+    ends because its output does, so it proves nothing.
+    """
+    slots = {one.place: at for at, one in enumerate(owes)}
+    owing, downstream = {one.node for one in owes}, downstream_of(dataflow)
+    by_node: dict[str, tuple[int, ...]] = {}
+    whole = set[str]()
+    for node in dataflow.nodes:
+        if node.id not in owing:
+            continue
+        places = sorted({one.source for one in node.inputs})
+        never = {"dora", node.id, *downstream[node.id]}
+        heard = [one for one in places if _origin(one) not in never and is_here(_origin(one))]
+        heard = [one for one in heard if one in slots or len(slots) < len(owes) + MOST_FEEDS]
+        by_node[node.id] = tuple(slots.setdefault(one, len(slots)) for one in heard)
+        whole |= {node.id} if places and len(heard) == len(places) else set()
+    return Feeds(tuple(slots), by_node, frozenset(whole))
+
+
+def starved_of(
+    flows: Sequence[Flow], quiet: int, tick: int, owed: Owed, is_first: bool, is_whole: bool
+) -> int | None:
+    """Which of the flows a silent node lacks; None if the silence is its own.
+
+    quiet: µs since its last message, or since its start if is_first. It is starved if nothing at
+    all came in since then, or if a regular input ended when its output did.
+    """
+    least = quiet - 2 * tick
+    ended = [at for at, one in enumerate(flows) if one.quiet >= least]
+    if is_whole and ended and len(ended) == len(flows):
+        return ended[0]
+    most = quiet + owed.within
+    regular = (at for at in ended if flows[at].steady >= _REGULAR * owed.within)
+    return next((at for at in regular if is_first or flows[at].quiet <= most), None)
+
+
+def _origin(source: str) -> str:
+    return source.partition("/")[0]
