@@ -11,6 +11,7 @@ from dora_systemd.adapters.runner_socket import client as runner_socket
 from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.dora.coordinator import Coordinator
+from dora_systemd.decisions.dora.node_command import parse_node_command
 from dora_systemd.decisions.dora.protocol import Params, Reply
 from dora_systemd.decisions.dora.variables import coordinator_variables
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -114,6 +115,20 @@ def order_node(scope: Scope, cell: Cell, given: NodeOrder, ask: Ask = order) -> 
     except DoraSystemdError as error:
         hint = error.hint.replace("NAME", cell.name)
         raise DoraSystemdError(error.message, hint, error.code) from error
+
+
+def order_like_dora(scope: Scope, cell: Cell, arguments: Sequence[str], ask: Ask = order) -> str:
+    """Have the runner do what is a `dora node restart` or `stop`; what dora would print.
+
+    "" for another command, and for one about another dataflow: they are dora's. Raises
+    DoraSystemdError.
+    """
+    given = parse_node_command(arguments)
+    if given is None or given.dataflow not in ("", cell.name):
+        return ""
+    door = f"doractl dora, dora node {given.what}"
+    order_node(scope, cell, NodeOrder(given.what, given.node, door, given.grace), ask)
+    return given.told
 
 
 def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[str]) -> int:

@@ -77,6 +77,33 @@ def test_a_node_is_killed(flow: Flow) -> None:
     assert flow.life() == life
 
 
+@pytest.mark.warns("failed to receive reply from daemon", "ExitCode(3) node_id=doubler")
+def test_what_somebody_asks_for_is_no_crash(flow: Flow) -> None:
+    """On no machine, however the node ends; and its restarts stay."""
+    life = flow.life()
+    there("b", "sh", "-c", "'echo \"raise SystemExit(3)\" >>/opt/flow/doubler.py'")
+    for _ in range(3):
+        flow.cell.doractl("node", "restart", NAME, "doubler")
+        wait_for("it runs", lambda: flow.table()["doubler"]["state"] == "running")
+        flow.wait_exchanging()
+    flow.cell.doractl("node", "restart", NAME, "sink")  # nobody reads it
+    wait_for("it runs", lambda: flow.table()["sink"]["state"] == "running")
+    flow.wait_exchanging()
+    assert flow.life() == life
+    assert flow.table()["doubler"]["restarts"] == 0
+    begin = there("b", "systemctl", "show", "-P", "InvocationID", f"dora-{NAME}").stdout.strip()
+    words = ("journalctl", "-q", "-o", "cat", "-t", f"{NAME}/doubler")
+    events = there("b", *words, f"_SYSTEMD_INVOCATION_ID={begin}").stdout
+    assert events.count("Node doubler: restart requested by root (doractl node restart)") == 3
+    assert "crashed" not in events
+    assert "Node doubler exited: exit code 3" in events
+    if "arm" in flow.members:
+        flow.cell.doractl("node", "stop", NAME, "sink")
+        assert flow.table()["sink"]["stopped_by"] == "root (doractl node stop)"
+        again = flow.cell.doractl("node", "restart", NAME, "sink", check=False)
+        assert f"doractl restart {NAME} starts the whole dataflow" in again.stderr
+
+
 @lost
 @killed
 @pytest.mark.parametrize("what", ["link", "ssh", "relay", "sshd"])

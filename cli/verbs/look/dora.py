@@ -5,7 +5,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.node import exec_dora
+from dora_systemd.verbs.node import exec_dora, order_like_dora
 
 
 @click.command("dora", context_settings={"ignore_unknown_options": True})
@@ -24,4 +24,8 @@ def command(selector: str, arguments: tuple[str, ...]) -> int:
     """
     scope = current_scope()
     bus = Bus(scope)
-    return exec_dora(scope, bus, Selector(selector).find(bus), arguments)
+    cell = Selector(selector).find(bus)
+    if told := order_like_dora(scope, cell, arguments):
+        click.echo(told)
+        return 0
+    return exec_dora(scope, bus, cell, arguments)

@@ -12,6 +12,7 @@ _SPAWNED = re.compile(r"spawned node with pid (\d+)")
 _EXITED = re.compile(
     r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"
 )
+_STALE = "ignoring stale exit from pid "
 _UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
 _CASCADED = re.compile(r"marking `(.+)` as cascading error caused by `(.+)`")
 
@@ -41,6 +42,11 @@ def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
     if cascaded := _CASCADED.match(record.message):
         return life.NodeCascaded(at_us, cascaded[1], cascaded[2])
     return None
+
+
+def is_note_of_stale(record: LogRecord) -> bool:
+    """Whether dora says that the exit before was of a process that it has replaced or removed."""
+    return record.target == "daemon" and record.message.startswith(_STALE)
 
 
 def parse_daemon_line(line: str, at_us: int) -> life.Event | None:

@@ -142,7 +142,9 @@ def _asked(nodes: NodeTable, event: life.NodeAsked) -> Change:
         return nodes, record  # it waits on: the next process is there already
     else:
         state = "starting" if is_stopped(old) else "reloading"
-        new = (event.status or old)._replace(state=state, pid=old.pid, since_us=event.at_us)
+        new = (event.status or old._replace(restarts=0))._replace(
+            state=state, pid=old.pid, since_us=event.at_us
+        )
         new = new._replace(machine=old.machine)
     return {**nodes, event.node: new._replace(asked=event.what, asked_by=event.by)}, record
 

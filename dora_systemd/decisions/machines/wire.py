@@ -151,8 +151,31 @@ class Stopping:
 
 RUNNER_ENDED = "its supervisor process has ended"
 """words of a Lost: what the relay of a member says when its runner has ended without a word."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Head to member: somebody has asked for a restart or stop of one of its nodes. by: who."""
+
+    node: str
+    what: str
+    by: str
+
+
 FromLink = Lost | Unreached | Taken
-Message = Forwards | FromLink | Part | Beat | Ready | Table | Refused | Ended | StopPart | Stopping
+Message = (
+    Forwards
+    | FromLink
+    | Part
+    | Beat
+    | Ready
+    | Table
+    | Refused
+    | Ended
+    | StopPart
+    | Stopping
+    | Asked
+)
 M = TypeVar("M", bound=Message)
 
 _TYPES: Mapping[str, type[Any]] = {
@@ -168,6 +191,7 @@ _TYPES: Mapping[str, type[Any]] = {
     "ended": Ended,
     "stop": StopPart,
     "stopping": Stopping,
+    "asked": Asked,
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 _NUMBERS = {"coordinator", "zenoh", "grace", "again", "version", "tries", "failed"}

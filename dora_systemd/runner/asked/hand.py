@@ -62,7 +62,9 @@ class Hand:
     async def replace(self, target: Target) -> None:
         """End the process of a node, and start the next one. Raises DoraSystemdError."""
         with self.run.nodes.exchanging(target.node):
-            if target.has_process and not target.has_readers:
+            # dora would add the node of another machine here.
+            is_lone = not target.has_readers and not target.status.machine
+            if target.has_process and is_lone:
                 await self._end("RemoveNode", target)
                 await self._begin(protocol.add_params(self._run, target.definition))
                 return

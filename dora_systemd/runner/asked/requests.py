@@ -73,7 +73,7 @@ class NodeRequests:
         node, old, cell = target.node, target.status, run.pump.cell
         if old.state != "waiting":
             _require_running(cell)
-            if _has_ended(old) and not is_stopped(old):
+            if (_has_ended(old) and not is_stopped(old)) or (is_stopped(old) and old.machine):
                 raise _gone(node, old)
         (new,) = initial_nodes({node: old.kind}, {"nodes": [target.definition]}, now_us()).values()
         await self._tell(run, target, life.NodeAsked(now_us(), node, RESTART, by, new))

@@ -59,6 +59,10 @@ _WATCH_SECONDS = 2.0
 _WORD_SECONDS = 1.0
 """Time for a member to say itself why its daemon is gone."""
 _EXTEND_SECONDS = 10.0
+_NOTE_SECONDS = 0.05
+"""Time for dora to say that an exit is of a process that it has replaced: its next words."""
+_TOLD_SECONDS = 3.0
+"""Longer than a member takes until its table comes, with the next beat."""
 
 
 class Head(Shared):
@@ -124,6 +128,20 @@ class Head(Shared):
             waits_for_lost=self.options.restart.policy != "no",
         )
 
+    def definition(self, node: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A node with dora's directory on its machine."""
+        (placed,) = with_works({"nodes": [node]}, self.roster.works())["nodes"]
+        return dict(placed)
+
+    async def tell_asked(self, machine: str, event: life.NodeAsked) -> None:
+        """Tell a member, and wait until its table has it: else it takes the end for a crash."""
+        if machine:
+            self.roster.tell(wire.Asked(event.node, event.what, event.by))
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_TOLD_SECONDS):
+                    while not self.roster.has_heard(machine, event):
+                        await asyncio.sleep(_AGAIN_SECONDS)
+
     def dialogue(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> Dialogue:
@@ -145,6 +163,7 @@ class HeadDialogue(Dialogue):
         self._roster, self._dora = roster, dora
         self._ends_at, self._is_ending = 0.0, False
         self._unreached: dict[str, str] = {}
+        self._exits: dict[str, life.NodeExited] = {}
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -260,9 +279,23 @@ class HeadDialogue(Dialogue):
             event = replace(event, pid=0)  # here another process has that number
         if isinstance(event, life.NodeExited):
             essential = is_essential(self._options.node_rights, event.node)
-            event = life_events.with_facts(event, False, None, essential)
-        if event is not None:
+            self._exits[event.node] = life_events.with_facts(event, False, None, essential)
+            self._loop.call_later(_NOTE_SECONDS, self._tell_exit, event.node)
+        elif event is not None:
             self._pump.push(event)
+
+    def _hear(self, record: protocol.LogRecord) -> None:
+        """Handle what dora says: that an exit was of an old process it says next."""
+        is_stale = life_events.is_note_of_stale(record)
+        for node in [record.node] if record.node else list(self._exits):
+            self._tell_exit(node, is_stale)
+        super()._hear(record)
+
+    def _tell_exit(self, node: str, is_stale: bool = False) -> None:
+        if (event := self._exits.pop(node, None)) is not None:
+            status = self._pump.cell.nodes.get(node)
+            is_due = status is not None and status.state in ("reloading", "stopped")
+            self._pump.push(replace(event, is_stale=is_stale and not is_due))
 
     async def _ask_stop(self) -> None:
         self._begin_end()

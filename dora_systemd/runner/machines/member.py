@@ -16,6 +16,7 @@ from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host import files
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.splice import Ends, taken_over
+from dora_systemd.decisions.cell.asked import RESTART, STOP
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus
@@ -146,6 +147,8 @@ class Member(Shared):
         if isinstance(message, wire.Stopping):
             self.stops_by_head = True
             self._push(life.HeadStops(now_us(), message.by or HEAD))
+        if isinstance(message, wire.Asked) and message.what in (RESTART, STOP):
+            self._push(life.NodeAsked(now_us(), message.node, message.what, message.by))
         if isinstance(message, wire.StopPart):
             self.grace = message.grace
             self._end_by_head("the head has lost another machine")

@@ -131,6 +131,11 @@ class Roster:
             if one.lines is not None:
                 one.lines.send(message)
 
+    def has_heard(self, machine: str, event: life.NodeAsked) -> bool:
+        """Whether the table of a machine says who has asked for what of its node."""
+        node = self._members[machine].table.nodes.get(event.node)
+        return node is not None and (node.asked, node.asked_by) == (event.what, event.by)
+
     def amend(self, table: CellStatus) -> CellStatus:
         """The table of the head, with what the members say of their nodes."""
         return merged(table, {name: one.table for name, one in self._members.items()})

@@ -70,6 +70,17 @@ def test_who_asks_for_what(scope: Scope, cell: Cell) -> None:
     assert request == {"verb": "node", "what": "stop", "node": "camera", "grace": 5}
 
 
+def test_dora_node_stop(scope: Scope, cell: Cell) -> None:
+    runner = FakeRunner({"done": ["Node stopping: camera"]})
+    words = ["node", "stop", "camera", "-d", "robot"]
+    assert node.order_like_dora(scope, cell, words, runner) == "Node `camera` stopped"
+    (request,) = runner.requests
+    assert str(request["by"]).endswith(" (doractl dora, dora node stop)")
+    assert not node.order_like_dora(scope, cell, [*words[:-1], "other"], runner)
+    assert not node.order_like_dora(scope, cell, ["node", "list"], runner)
+    assert len(runner.requests) == 1
+
+
 def test_unknown_node(scope: Scope, cell: Cell) -> None:
     with pytest.raises(DoraSystemdError, match="cannot find a node 'camer'") as caught:
         node.order_node(scope, cell, replace(STOP, node="camer"))
