@@ -97,6 +97,7 @@ INVARIANTS: dict[str, Invariant] = {
     for one in (
         *(lives.one_life_at_a_time, lives.inside_the_unit, lives.restarts_are_counted_once),
         *(views.last_wish_or_reason, views.views_agree, views.nodes_are_real, views.uuid_is_stable),
+        *(views.what_a_hand_stops_is_no_failure, views.nodes_obey),
         *(
             views.why_lists_each_restart,
             lines.every_line_once,

@@ -63,6 +63,23 @@ FOUND: dict[str, tuple[Step, ...]] = {
         Step(LOOK),
         Step("kill-gateway"),
     ),
+    # By hand, before: the second restart was counted, and the third was the last.
+    "a hand restarts, stops and restarts": (
+        *_BEGIN,
+        Step("node-restart-sink"),
+        Step("node-restart-sink"),
+        Step("node-restart"),
+        Step(LOOK),
+        Step("node-stop"),
+        Step(LOOK),
+        Step("node-stop-source"),
+        Step(LOOK),
+        Step("node-restart-sink"),
+        Step("node-restart"),
+        Step(LOOK),
+        Step("kill-sink"),
+        Step(LOOK),
+    ),
     # Seed 329: one restart was counted, and none listed.
     "a node is stopped while it crashes": (
         *_BEGIN,

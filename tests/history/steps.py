@@ -79,7 +79,9 @@ COMMANDS = {
     "set": Command("doractl set $name --hot-reload on", weight=2),
     "set-memory": Command("doractl set $name --memory-limit 3G"),
     "node-restart": Command("doractl node restart $name source", weight=2),
+    "node-restart-sink": Command("doractl node restart $name sink", weight=2),
     "node-stop": Command("doractl node stop $name sink"),
+    "node-stop-source": Command("doractl node stop $name source"),
     "run": Command(
         f'doractl run "$place/project/dataflow.yml" {_FLAGS} --stop-after 2s >/dev/null',
         Wish.STOP,

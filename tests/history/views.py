@@ -134,6 +134,46 @@ def why_lists_each_restart(history: History) -> Iterator[str]:
                 yield f"step {look.at}: {cell}: {key}: {count} are counted, why lists {told[key]}"
 
 
+def what_a_hand_stops_is_no_failure(history: History) -> Iterator[str]:
+    """A node that somebody has stopped says so, does nothing, and fails nothing."""
+    for look, cell, view in quiet_looks(history):
+        nodes = (view.listed or {}).get("nodes", ())
+        stopped = {node["node"]: node for node in nodes if node.get("stopped_by")}
+        for name, node in stopped.items():
+            if node["state"] != "stopped" or node["pid"]:
+                yield f"step {look.at}: {cell}: {name} was stopped, and is {node}"
+        states = {node["state"] for node in nodes if node["node"] not in stopped}
+        status = (view.listed or {}).get("status")
+        if stopped and states <= {"running"} and status != "Running":
+            yield f"step {look.at}: {cell}: only stopped nodes are down, and it is {status}"
+        if view.why and stopped and view.why.get("node") in stopped:
+            yield f"step {look.at}: {cell}: why blames {view.why['node']}, which was stopped"
+
+
+_ORDERS = {
+    "node-restart": ("source", ("running", "waiting")),
+    "node-restart-sink": ("sink", ("running", "waiting")),
+    "node-stop": ("sink", ("stopped",)),
+    "node-stop-source": ("source", ("stopped",)),
+}
+
+
+def nodes_obey(history: History) -> Iterator[str]:
+    """A node is as the last command for it says, if that has succeeded just before a look."""
+    looks = {look.at: look for look in history.looks if look.is_quiet}
+    for answer in history.answers:
+        node, states = _ORDERS.get(answer.step.what, ("", ()))
+        look = looks.get(answer.at + 1)
+        if not node or look is None or answer.status or answer.step.is_joined or answer.was_hit:
+            continue
+        view = look.cells[answer.step.cell]
+        rows = (view.listed or {}).get("nodes", ()) if view.unit["ActiveState"] == "active" else ()
+        for row in rows:
+            is_refused = "Node not running" in answer.stdout
+            if row["node"] == node and row["state"] not in states and not is_refused:
+                yield f"step {look.at}: {answer.step.what} succeeded, and it is {row['state']}"
+
+
 def nodes_are_real(history: History) -> Iterator[str]:
     """A node that runs is exactly the process that is in its group."""
     for look, cell, view in quiet_looks(history):

@@ -139,7 +139,8 @@ def _asked(nodes: NodeTable, event: life.NodeAsked) -> Change:
             **{key: getattr(old, key) for key in _KEPT}, is_held=old.state == "waiting"
         )
     elif old.state == "waiting":
-        return nodes, record  # it waits on: the next process is there already
+        # It waits on: the next process is there already, and dora counts from zero since then.
+        return {**nodes, event.node: old._replace(restarts=0)}, record
     else:
         state = "starting" if is_stopped(old) else "reloading"
         new = (event.status or old._replace(restarts=0))._replace(

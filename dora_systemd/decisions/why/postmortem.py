@@ -6,6 +6,7 @@ If the cause is not recorded, the verdict says so; it never guesses.
 from collections.abc import Sequence
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.asked import RESTART
 from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.owed import STARVED
@@ -286,7 +287,7 @@ def restarts_of(chain: Sequence[Life]) -> list[Restart]:
 
 _FRESH = {
     "node-reloaded": (How.SWAP.value, How.REWIRE.value),
-    "node-asked": ("",),
+    "node-asked": (RESTART,),
     "reloaded": ("",),
     "machine-lost": ("",),
 }
@@ -295,13 +296,17 @@ _FRESH = {
 
 def _counted(restarts: Sequence[Restart], life: Life, facts: Facts) -> list[Restart]:
     """Those that `list` counts: by systemd since the last reset, and by dora in this run."""
-    fresh = [one for one in life.all(*_FRESH) if one.detail("how") in _FRESH[one.name]]
+    fresh = [one for one in life.all(*_FRESH) if _what(one) in _FRESH[one.name]]
     since = {one.node: one.at_us for one in fresh}
     begin = max(life.began_us, since.get("", 0))
     whole = [one for one in restarts if one.owner == "systemd"]
     left = len(whole) if facts.restarts is None else facts.restarts
     own = [one for one in restarts if one.node and one.at_us >= max(begin, since.get(one.node, 0))]
     return sorted([*whole[max(len(whole) - left, 0) :], *own], key=lambda one: one.at_us)
+
+
+def _what(one: Happening) -> str:
+    return one.detail("asked") if one.name == "node-asked" else one.detail("how")
 
 
 _NO_NEWS = (

@@ -82,6 +82,12 @@ def last(of_a: CellView) -> dict[str, Any]:
 NAMELESS = tuple(replace(line, has_unit=False) for line in GOOD.lines)
 
 
+def stopped(status: str = "Running", **changes: Any) -> dict[str, Any]:
+    """The row of a dataflow whose node somebody has stopped."""
+    node = {"state": "stopped", "pid": None, "stopped_by": "root", **changes}
+    return {**ROW, "status": status, "nodes": [{**ROW["nodes"][0], **node}]}
+
+
 BROKEN: list[tuple[str, dict[str, Any]]] = [
     ("one_life_at_a_time", {"sights": ((sight("i"), sight("j", began=200)), (sight("i"),))}),
     ("one_life_at_a_time", {"sights": ((sight("j", began=200), sight("")),)}),
@@ -100,6 +106,10 @@ BROKEN: list[tuple[str, dict[str, Any]]] = [
     ("views_agree", last(replace(view(), metrics={"dora_dataflow_restarts_total{}": 7}))),
     ("why_lists_each_restart", last(view(why={**ROW, "restart_history": [BY_DORA]}))),
     ("nodes_are_real", last(replace(view(), pids={"node-sink": (10,)}))),
+    ("what_a_hand_stops_is_no_failure", last(view(stopped(pid=9), stopped()))),
+    ("what_a_hand_stops_is_no_failure", last(view(stopped("Degraded"), stopped("Degraded")))),
+    ("what_a_hand_stops_is_no_failure", last(view(stopped(), {**stopped(), "node": "sink"}))),
+    ("nodes_obey", {"answers": (answer(0, "start"), answer(2, "node-stop"))}),
     ("uuid_is_stable", last(view({**ROW, "uuid": "2"}, {**ROW, "uuid": "2"}))),
     ("every_line_once", {"printed": {(A, "sink.1"): 4}}),
     ("every_line_once", {"lines": (*GOOD.lines, Line(A, "sink.1", 2))}),
@@ -124,6 +134,11 @@ BROKEN: list[tuple[str, dict[str, Any]]] = [
 
 def test_a_good_history_breaks_nothing() -> None:
     assert check(GOOD) == []
+
+
+def test_a_node_that_obeys_breaks_nothing() -> None:
+    answers = (answer(0, "start"), answer(2, "node-stop"))
+    assert check(replace(GOOD, answers=answers, **last(view(stopped(), stopped())))) == []
 
 
 def test_a_restart_before_a_start_counts() -> None:

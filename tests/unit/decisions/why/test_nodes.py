@@ -33,6 +33,17 @@ def test_how_each_node_was_left() -> None:
     }
 
 
+def test_a_node_that_somebody_had_stopped() -> None:
+    asked = Happening("node-asked", 2, "plot", details={"asked": "stop"})
+    exited = Happening("node-exited", 3, "plot", details={"asked": "stop", "exit": "exit code 3"})
+    again = Happening("node-asked", 4, "plot", details={"asked": "restart"})
+    ready = (Happening("node-ready", 1, "plot"),)
+    (row,) = ended_nodes(Life((*ready, asked, exited, again)))
+    assert (row.state, row.exit) == ("stopped", "exit code 3")
+    (row,) = ended_nodes(Life((*ready, asked)))
+    assert row.state == "stopped"
+
+
 def test_restarts_are_counted_and_the_last_exit_stays() -> None:
     (row,) = ended_nodes(
         life(

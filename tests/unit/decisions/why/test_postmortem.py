@@ -304,6 +304,10 @@ def test_restarts_are_those_that_list_counts() -> None:
     assert counted(fresh, restarts=0) == "camera"
     limits = event("node-reloaded", "plot", "3", how="given new limits")
     assert counted(limits, restarts=0) == "camera plot"
+    asked = event("node-asked", "plot", "3", asked="restart")
+    assert counted(asked, restarts=0) == "camera"
+    stopped = event("node-asked", "plot", "3", asked="stop")
+    assert counted(stopped, restarts=0) == "camera plot"
     again = (event("reloaded", life="3"), restarted("plot", "3"))
     assert counted(*again, restarts=0) == "plot"
 

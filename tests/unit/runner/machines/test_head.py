@@ -284,12 +284,29 @@ def test_a_daemon_that_hangs_is_a_lost_machine(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
+def test_an_exit_of_a_process_that_dora_has_replaced(tmp_path: Path) -> None:
+    """The head cannot see whether a newer process of the node is there: dora says so."""
+
+    async def work(bench: Bench) -> None:
+        bench.be(State.RUNNING)
+        said = "handling node stop with exit status Success (restart: false"
+        stale = "ignoring stale exit from pid 7 (generation 2); `mid` has been removed or replaced"
+        bench.dialogue._hear(LogRecord("DEBUG", *MID, said))
+        bench.dialogue._hear(LogRecord("DEBUG", *MID, stale))
+        (event,) = bench.heard(life.NodeExited)
+        assert isinstance(event, life.NodeExited)
+        assert event.is_stale
+
+    run(tmp_path, work)
+
+
 def test_a_pid_of_another_machine_means_nothing_here(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         bench.be(State.RUNNING)
         bench.dialogue._hear(LogRecord("DEBUG", "spawner", "mid", "spawned node with pid 1"))
         said = "handling node stop with exit status Signal(9) (restart: false"
         bench.dialogue._hear(LogRecord("DEBUG", *MID, said))
+        bench.dialogue._hear(LogRecord("INFO", *MID, "its next words"))
         assert bench.heard(life.NodeSpawned) == [life.NodeSpawned(0, "mid", 0)]
         assert bench.heard(life.NodeExited) == [life.NodeExited(0, "mid", exit_of(-9), False)]
         assert bench.nodes.calls == [], "no process here is touched"

@@ -132,9 +132,11 @@ def test_another_version_of_dora_is_refused(tmp_path: Path) -> None:
 def test_what_the_head_says(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         other = await bench.head()
+        other.say(wire.Asked("mid", "restart", "root"), wire.Asked("mid", "other", "root"))
         other.say(wire.Stopping("SIGTERM"), wire.StopPart(SECOND))
         await settle()
         assert bench.heard()[1:] == [
+            life.NodeAsked(0, "mid", "restart", "root"),
             life.HeadStops(0, "SIGTERM"),
             life.HeadLost(0, "the head has lost another machine"),
         ]
