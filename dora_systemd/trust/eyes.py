@@ -53,6 +53,7 @@ def answer(letter: bytes, path: bytes, most: int) -> bytes:
         b"e": True,
         b"d": stat.S_ISDIR(mode),
         b"x": stat.S_ISREG(mode) and os.access(path, os.X_OK),
+        b"w": os.access(path, os.W_OK),
     }
     return b"1" if is_so[letter] else b""
 

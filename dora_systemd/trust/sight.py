@@ -45,6 +45,10 @@ class Sight:
         """Whether it is an executable program."""
         return self._is(b"x", path)
 
+    def is_writable(self, path: str) -> bool:
+        """Whether the account may write it."""
+        return self._is(b"w", path)
+
     def real(self, path: str) -> str:
         """The path with all symbolic links resolved."""
         with contextlib.suppress(OSError):

@@ -380,7 +380,9 @@ def test_what_is_refused(cell: Cell, project: Project) -> None:
         [
             Refusal([flow, "--sandbox=strikt"], ExitCode.USAGE, "did you mean strict?"),
             Refusal([flow, "--network=lan"], ExitCode.USAGE, "host, loopback, private"),
-            Refusal([flow, "--writable=/nowhere"], ExitCode.BAD_INPUT, "mkdir -p /nowhere"),
+            Refusal(
+                [flow, "--writable=/nowhere"], ExitCode.BAD_INPUT, "install -d -o dora /nowhere"
+            ),
         ],
     )
     project.write("dataflow.systemd.yml", "sandbox: 5\n")

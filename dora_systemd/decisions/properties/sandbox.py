@@ -69,7 +69,8 @@ class Sandbox:
     has_identity: the user fits into a namespace with the first 65536 ids. needed: absolute
     paths to read, such as the project. writable: paths to write. firm: by path of these two,
     the part that only root can replace; without an entry all of it. directory: the
-    RuntimeDirectory of the unit, the only one that nodes see; "": all are visible.
+    RuntimeDirectory of the unit, the only one that nodes see; "": all are visible. denied: paths
+    to write that the nodes' user, `user`, must not write.
     """
 
     level: str = DEFAULT_LEVEL
@@ -84,6 +85,8 @@ class Sandbox:
     writable: Sequence[str] = ()
     firm: Mapping[str, str] = field(default_factory=dict)
     directory: str = ""
+    denied: Sequence[str] = ()
+    user: str = ""
 
     @property
     def has_mounts(self) -> bool:

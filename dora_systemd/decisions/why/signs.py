@@ -11,11 +11,20 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
         "its Python has no dora-rs: pip install dora-rs there, or give its environment with --venv",
     ),
     (
-        ("Read-only file system", "EROFS"),
-        f"files are read-only in the sandbox: --writable PATH allows one, {_MORE}",
+        ("/.cache/uv`",),
+        f"uv cannot write its cache: --env UV_CACHE_DIR=/tmp/uv gives it one, {_MORE}",
     ),
     (
-        ("No such file or directory: '/dev/", "No such file or directory: /dev/"),
+        ("Read-only file system", "EROFS"),
+        "files are read-only in the sandbox: --writable PATH allows one (of a release none: have "
+        f"the node write to an absolute path outside of it), {_MORE}",
+    ),
+    (
+        (
+            "No such file or directory: '/dev/",
+            "No such file or directory: /dev/",
+            "can't open camera by index",
+        ),
         f"devices are hidden in the sandbox: --device PATH allows one, {_MORE}",
     ),
     (

@@ -1,6 +1,7 @@
 """The sandbox of a plan: the paths that must stay accessible, and what a scope cannot enforce."""
 
 import pwd
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -47,7 +48,8 @@ def make_sandbox(
     sight = sight or Sight()
     options = prepared.plan.options
     rights = options.node_rights
-    given = [_checked(path, sight) for path in settings[WRITABLE]]
+    given = [_checked(path, sight, user) for path in settings[WRITABLE]]
+    denied = [] if user is None else [path for path in given if not sight.is_writable(path)]
     needed = tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight)))
     writable = (*given, *_existing(_written_by_uv(options, user, sight), sight))
     return Sandbox(
@@ -65,6 +67,8 @@ def make_sandbox(
         writable=writable,
         firm={} if scope.is_user else _firm((*needed, *writable), user),
         directory=str(scope.cell_directory(options.name)),
+        denied=denied,
+        user="" if user is None else user.pw_name,
     )
 
 
@@ -87,6 +91,9 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
         yield f"the sandbox cannot hide {place}: users other than root can replace {shown(path)}"
     for place, path in {place: path for path, place in widened_paths(sandbox)}.items():
         yield f"the nodes may write all of {shown(place)}: its user could replace {shown(path)}"
+    for path in sandbox.denied:
+        change = f"chown {sandbox.user} {shlex.quote(path)}"
+        yield f"the nodes run as {sandbox.user}, who cannot write {shown(path)}: {change}"
     if not sandbox.is_user:
         return
     if sandbox.level == "strict":
@@ -128,12 +135,13 @@ def _names(settings: Settings, *keys: str) -> bool:
     return any(one.partition("=")[0] in keys for one in settings[PROPERTY])
 
 
-def _checked(path: str, sight: Sight) -> str:
+def _checked(path: str, sight: Sight, user: pwd.struct_passwd | None) -> str:
     absolute = str(Path(path).absolute())
     if not sight.exists(absolute):
+        make = "mkdir -p" if user is None else f"install -d -o {user.pw_name}"
         raise DoraSystemdError(
             f"cannot let the nodes write {shown(absolute)}: there is no such file",
-            f"mkdir -p {absolute}, or correct --writable",
+            f"{make} {shlex.quote(absolute)}, or correct --writable",
             ExitCode.BAD_INPUT,
         )
     return absolute_path(absolute)

@@ -271,6 +271,7 @@ def made(
     tmp_path: Path,
     nodes: str = "/opt/x/camera",
     user: pwd.struct_passwd = ME,
+    sight: Sight | None = None,
     **flags: object,
 ) -> Sandbox:
     own = options(
@@ -279,7 +280,7 @@ def made(
     document = {"nodes": [{"id": "a", "path": nodes, "outputs": ["x"]}]}
     plan = LaunchPlan(own, "/l.sh", "/nowhere", os.path.exists, Sight().read)
     prepared = Prepared(parse_dataflow(document, "flow.yml"), plan, {})
-    return make_sandbox(SYSTEM, resolve_settings(flags, {}, []), user, prepared)
+    return make_sandbox(SYSTEM, resolve_settings(flags, {}, []), user, prepared, sight)
 
 
 def test_what_a_plan_needs(tmp_path: Path) -> None:
@@ -290,6 +291,28 @@ def test_what_a_plan_needs(tmp_path: Path) -> None:
     assert len(set(sandbox.needed)) == len(sandbox.needed)
     assert (sandbox.level, sandbox.network, sandbox.writable) == ("default", "host", ())
     assert str(tmp_path) in made(tmp_path, uv=True).writable
+
+
+class NotMine(Sight):
+    """The sight of a user who may write nothing below /srv."""
+
+    def exists(self, path: str) -> bool:
+        return path != "/srv/new"
+
+    def is_writable(self, path: str) -> bool:
+        return not path.startswith("/srv")
+
+
+def test_what_the_user_of_the_nodes_cannot_write(tmp_path: Path) -> None:
+    robot = pwd.struct_passwd(("robot", "x", 990, 990, "", "/", "/bin/sh"))
+    given = ("/srv/a b", str(tmp_path))
+    sandbox = made(tmp_path, user=robot, sight=NotMine(), writable=given)
+    words = "the nodes run as robot, who cannot write /srv/a b: chown robot '/srv/a b'"
+    assert words in list(sandbox_warnings(sandbox))
+    assert "cannot write" not in str(list(sandbox_warnings(made(tmp_path, writable=given[1:]))))
+    with pytest.raises(DoraSystemdError) as caught:
+        made(tmp_path, user=robot, sight=NotMine(), writable=("/srv/new",))
+    assert str(caught.value.hint).startswith("install -d -o robot /srv/new,")
 
 
 def test_a_workspace_of_uv(tmp_path: Path) -> None:
@@ -344,7 +367,8 @@ def test_writable_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert made(tmp_path, writable=("..", ".")).writable == (str(tmp_path), f"{tmp_path}/a")
     with pytest.raises(DoraSystemdError, match="there is no such file") as caught:
         made(tmp_path, writable=("none",))
-    assert caught.value.hint == f"mkdir -p {tmp_path}/a/none, or correct --writable"
+    make = f"install -d -o {ME.pw_name} {tmp_path}/a/none"
+    assert caught.value.hint == f"{make}, or correct --writable"
     assert caught.value.code is ExitCode.BAD_INPUT
 
 
@@ -373,6 +397,8 @@ def test_absolute_paths(tmp_path: Path) -> None:
         ("OSError: [Errno 28] No space left on device", "that the node writes to"),
         ("OSError: [Errno 28] No space left on device: '/a/{b}'", "df '/a/{b}'"),
         ("", ""),
+        ("error: Failed to initialize cache at `/.cache/uv`", "--env UV_CACHE_DIR=/tmp/uv"),
+        ("[ WARN:0] VIDEOIO(V4L2:/dev/video0): can't open camera by index", "--device PATH"),
     ],
 )
 def test_signs_of_the_sandbox(line: str, words: str) -> None:
