@@ -12,9 +12,13 @@ from dora_systemd.verbs.inhibit.guard import IfInhibited
 C = TypeVar("C", bound=Callable[..., Any])
 
 
-def inhibit_options(command: C) -> C:
-    """Add the options `force` and `wait`, see if_inhibited()."""
-    force = click.option("--force", is_flag=True, help="Do it even if a lock inhibits it.")
+def inhibit_options(command: C, or_else: str = "") -> C:
+    """Add the options `force` and `wait`, see if_inhibited().
+
+    or_else: what else --force overrides, for --help.
+    """
+    text = f"Do it even if a lock inhibits it{or_else}."
+    force = click.option("--force", is_flag=True, help=text)
     wait = click.option("--wait", is_flag=True, help="Wait while a lock inhibits it.")
     return force(wait(command))
 

@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 
 import click
 
-from dora_systemd.cli.edge import print_warning
+from dora_systemd.cli.edge import print_error, print_warning
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
@@ -164,12 +164,15 @@ def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) ->
 
 
 def print_outcomes(outcomes: Iterable[Outcome]) -> ExitCode:
-    """One line or one JSON object for each outcome, at once; FAILURE if any has a problem."""
-    status = ExitCode.OK
+    """One line or one JSON object for each outcome, at once.
+
+    Returns the exit status of the problem, FAILURE if there are different ones.
+    """
+    codes = set()
     for one in outcomes:
         _print_outcome(one)
-        status = ExitCode.FAILURE if one.problem else status
-    return status
+        codes |= {one.code} if one.problem else set()
+    return codes.pop() if len(codes) == 1 else ExitCode.FAILURE if codes else ExitCode.OK
 
 
 def _print_outcome(one: Outcome) -> None:
@@ -178,8 +181,8 @@ def _print_outcome(one: Outcome) -> None:
 
         _, _, action = click.get_current_context().command_path.partition(" ")
         click.echo(format_json(outcome_object(one, action)))
-    elif one.problem:
-        print_warning(one.problem, is_json=False)
+    elif one.error:
+        print_error(one.error, is_json=False)
     else:
         click.echo(one.text)
 

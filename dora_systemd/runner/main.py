@@ -58,6 +58,7 @@ from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.rights import check_first
 from dora_systemd.runner.owes.begin import begin_watch
+from dora_systemd.runner.recheck import Recheck
 from dora_systemd.runner.reload.apply import Run, tell_started
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
@@ -155,7 +156,7 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     beside.spawn("forget restarts", forget_restarts(options))
     beside.spawn("count restarts", learn_first(runs.this_life, options.name, is_user))
     role = runs.role
-    answer = NodeRequests(runs.reloader, role).answer
+    answer = Recheck(role, runs.environment, NodeRequests(runs.reloader, role).answer).answer
     socket = serve(runs.paths.socket, answer, reach, role.sessions, role.door)
     beside.spawn("serve its socket", socket)
     if "WATCHDOG_USEC" in os.environ:

@@ -10,7 +10,8 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.node import NodeOrder, order_node
-from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
+from dora_systemd.verbs.restart import restart_cells
+from dora_systemd.verbs.stop import note_stop, stop_cells
 
 
 def act_on(
@@ -38,13 +39,13 @@ def act_on(
         (outcome,) = stop_cells(manager, scope, [cell], observer)
         return told(outcome)
     with uninhibited(scope, [cell], "restart"):
-        note_stop([cell], by)
-        (outcome,) = restart_cells(manager, [cell], observer)
+        (outcome,) = restart_cells(manager, scope, [cell], by, observer=observer)
     return told(outcome)
 
 
 def told(outcome: Outcome) -> str:
     """What was done. Raises DoraSystemdError for a problem."""
     if outcome.problem:
-        raise DoraSystemdError(outcome.problem, f"doractl why {outcome.subject.name}")
+        hint = outcome.hint or f"doractl why {outcome.subject.name}"
+        raise DoraSystemdError(outcome.problem, hint, outcome.code)
     return outcome.text

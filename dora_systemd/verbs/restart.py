@@ -1,33 +1,85 @@
-"""`doractl restart` of what has ended."""
+"""Restarts dataflows that systemd has loaded, unless their next start would be refused."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager, StageObserver
+from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer
+from dora_systemd.adapters.host.process import beside
+from dora_systemd.adapters.runner_socket.client import ask_refusal
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.start.again import Asked
-from dora_systemd.verbs.start.job import start_unit
-from dora_systemd.verbs.start.launch import claim
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.reason import job_reason
+from dora_systemd.verbs.node import socket_of
+from dora_systemd.verbs.stop import note_stop
+
+Ask = Callable[[Path], DoraSystemdError | None]
+"""The error with which the runner at a path would refuse to start again."""
 
 
-def restart_asked(
+def restart_cells(
     manager: Manager,
     scope: Scope,
-    asked: Asked,
-    environment: Mapping[str, str],
-    on_stage: StageObserver | None,
-) -> Outcome:
-    """Start what has ended once more, with the UUID and the settings it had, and wait for it.
+    cells: Sequence[Cell],
+    by: str,
+    is_forced: bool = False,
+    observer: Observer | None = None,
+    ask: Ask = ask_refusal,
+) -> list[Outcome]:
+    """Stop and start dataflows in parallel, and wait until their nodes are ready.
 
-    environment: the caller's variables.
+    A dataflow that could not start again keeps running, unless is_forced. by: what requests the
+    restart, for the journal. The restart resets the counter of automatic restarts.
     """
+    refused = {} if is_forced else find_refusals(scope, cells, ask)
+    chosen = [cell for cell in cells if cell not in refused]
+    note_stop(chosen, by)
+    for cell in chosen:
+        manager.hold(cell.unit)  # keep a failed transient unit and its failure
+        manager.reset_failed(cell.unit)
+    results = manager.run_jobs("RestartUnit", [cell.unit for cell in chosen], observer)
+    return [
+        Outcome.of_error(cell, refused[cell])
+        if cell in refused
+        else _outcome(manager, cell, results[cell.unit])
+        for cell in cells
+    ]
+
+
+def find_refusals(
+    scope: Scope, cells: Sequence[Cell], ask: Ask = ask_refusal
+) -> Mapping[Cell, DoraSystemdError]:
+    """The running dataflows that could not start again, each with the error of its start.
+
+    A runner that does not answer is no reason to leave its dataflow as it is.
+    """
+    running = [cell for cell in cells if cell.has_begun]
+    asked = [(cell, beside(partial(_find_refusal, scope, cell, ask))) for cell in running]
+    return {cell: error for cell, answer in asked if (error := answer.result())}
+
+
+def require_startable(scope: Scope, cell: Cell, ask: Ask = ask_refusal) -> None:
+    """Raise the error that a start of a running dataflow would end with."""
+    for error in find_refusals(scope, [cell], ask).values():
+        raise error
+
+
+def _find_refusal(scope: Scope, cell: Cell, ask: Ask) -> DoraSystemdError | None:
     try:
-        request = asked.request(StartRequest(asked.dataflow, environment=environment))
-        claimed = claim(manager, scope, request, "doractl restart")
-        options = claimed.plan.options
-        start_unit(manager, scope, options, claimed.properties, on_stage, True, claimed.links)
-    except DoraSystemdError as error:
-        return Outcome(asked, "", "; ".join(filter(None, (error.message, error.hint))))
-    return Outcome(asked, f"Dataflow restarted: {asked.uuid} ({asked.name})")
+        error = ask(socket_of(scope, cell))
+    except DoraSystemdError:
+        return None
+    if error is None:
+        return None
+    goes_on = f"{cell.name} keeps running; doractl restart --force {cell.name} restarts it anyway"
+    hint = ", ".join(filter(None, (error.hint, goes_on)))
+    return DoraSystemdError(error.message, hint, error.code)
+
+
+def _outcome(manager: Manager, cell: Cell, result: str) -> Outcome:
+    if result == JOB_DONE:
+        return Outcome(cell, f"Dataflow restarted: {cell.uuid} ({cell.name})")
+    reason = job_reason(manager, cell.unit, result)
+    return Outcome(cell, "", f"cannot restart {cell.unit}: {reason}")

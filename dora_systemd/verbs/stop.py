@@ -1,4 +1,4 @@
-"""`doractl stop`, `restart` and `reset`: what systemd does for several dataflows at once."""
+"""`doractl stop` and `reset`: what systemd does for several dataflows at once."""
 
 import signal
 import time
@@ -16,7 +16,7 @@ from dora_systemd.trust.paths import exists
 from dora_systemd.values import INFINITY, SECOND, format_duration
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units, own_directories, trial_path
-from dora_systemd.verbs.facts.reason import failure_reason, job_reason
+from dora_systemd.verbs.facts.reason import failure_reason
 from dora_systemd.verbs.start.asked import note_request
 
 UNBOUNDED_SECONDS = 90.0
@@ -173,20 +173,6 @@ def end_links_of(manager: Manager, cells: Sequence[Cell]) -> None:
             end_links(manager, name)
 
 
-def restart_cells(
-    manager: Manager, cells: Sequence[Cell], observer: Observer | None = None
-) -> list[Outcome]:
-    """Stop and start dataflows in parallel, and wait until their nodes are ready.
-
-    A requested restart resets the counter of automatic restarts.
-    """
-    for cell in cells:
-        manager.hold(cell.unit)  # keep a failed transient unit and its failure
-        manager.reset_failed(cell.unit)
-    results = manager.run_jobs("RestartUnit", [cell.unit for cell in cells], observer)
-    return [_restart_outcome(manager, cell, results[cell.unit]) for cell in cells]
-
-
 def reset_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
     """Clear the restarts used up by each dataflow, and its failure; what runs goes on running.
 
@@ -247,13 +233,6 @@ def _stopped(cell: Cell, note: str) -> str:
 
 def _not_running(cell: Cell) -> Outcome:
     return not_running(cell, "has failed" if cell.state.active == "failed" else "does not run")
-
-
-def _restart_outcome(manager: Manager, cell: Cell, result: str) -> Outcome:
-    if result == JOB_DONE:
-        return Outcome(cell, f"Dataflow restarted: {cell.uuid} ({cell.name})")
-    reason = job_reason(manager, cell.unit, result)
-    return Outcome(cell, "", f"cannot restart {cell.unit}: {reason}")
 
 
 def _reset(manager: Manager, cell: Cell) -> Outcome:

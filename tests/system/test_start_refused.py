@@ -166,3 +166,25 @@ def test_every_way_of_starting_refuses_the_same(cell: Cell, project: Project) ->
     (words_of_all,) = said
     assert "colour" in words_of_all
     assert not cell.systemctl("list-unit-files", "--no-legend", check=False)
+
+
+def test_a_restart_that_would_be_refused_stops_nothing(cell: Cell, project: Project) -> None:
+    """It says what a start says, or a reload of a program; the dataflow runs on."""
+    flow = project.three_nodes()
+    cell.start(flow)
+    good, main_pid = flow.read_text(), cell.show("MainPID")
+    flow.write_text(BAD_FILES["unknown-key"])
+    started = cell.doractl("start", str(flow), "--name", f"{cell.name}-2", check=False)
+    broken = cell.doractl("restart", cell.name, check=False)
+    assert (broken.returncode, broken.stdout) == (ExitCode.BAD_INPUT, "")
+    assert broken.stderr.splitlines()[0] == started.stderr.splitlines()[0]
+    assert "keeps running" in broken.stderr
+    flow.write_text(good)
+    (project.root / "sink.py").write_text("def (")
+    broken = cell.doractl("restart", cell.name, check=False)
+    assert broken.returncode == ExitCode.BAD_INPUT
+    assert "sink.py: line 1: invalid syntax" in broken.stderr
+    assert cell.show("MainPID") == main_pid
+    project.three_nodes()
+    cell.doractl("restart", cell.name)
+    assert cell.show("MainPID") != main_pid

@@ -13,19 +13,20 @@ from dora_systemd.cli.parameters import acting_options, current_scope, print_out
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
+from dora_systemd.verbs.restart import restart_cells
 from dora_systemd.verbs.start.again import find_known
-from dora_systemd.verbs.stop import note_stop, restart_cells
 
 
 @click.command("restart")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
-@inhibit_options
+@partial(inhibit_options, or_else=", or its files could not start")
 @acting_options
 def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
     """Restart dataflows and wait until all their nodes are ready again.
 
     Name, UUID and settings stay; the dataflow file is read again. A dataflow that has failed or
-    ended is started again. Refused while doractl inhibit or a node inhibits it.
+    ended is started again. Refused while doractl inhibit or a node inhibits it, and for a dataflow
+    whose files could not start; it keeps running then.
 
     Examples:
       doractl restart robot
@@ -37,10 +38,10 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
     cells, ended = find_known(bus, scope, selectors)
     refuse_parts(cells, "restart")
     with uninhibited(scope, cells, "restart", how, TellWaiting()), StageLine(sys.stderr) as stage:
-        note_stop(cells, "doractl restart")
-        outcomes = restart_cells(bus, cells, partial(tell_stage, stage)) if cells else []
+        observer = partial(tell_stage, stage)
+        outcomes = restart_cells(bus, scope, cells, "doractl restart", force, observer)
         if ended:
-            from dora_systemd.verbs.restart import restart_asked
+            from dora_systemd.verbs.start.launch import restart_asked
 
             outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]
     return print_outcomes(outcomes)

@@ -51,11 +51,19 @@ class DoraCheck:
         self._refusal = beside(check_dataflow)
 
     def beside(self, call: Callable[[], T]) -> T:
-        """Call `call` while the checks run; its result. Errors of the checks take precedence."""
+        """Call `call`, which reads the dataflow, while the checks run; its result.
+
+        Its error takes precedence over that of dora about the same file: doractl reports it before
+        a start, too. Without access to the file, or without dora, that is the error.
+        """
         try:
-            return call()
-        finally:
-            self.result()
+            found = call()
+        except DoraSystemdError:
+            check_access(self._options)
+            self.version()
+            raise
+        self.result()
+        return found
 
     def version(self) -> str:
         """Wait for the version of dora, "" for one that listens. Raises DoraSystemdError."""

@@ -47,6 +47,28 @@ def order(path: Path, request: Request, seconds: float = RELAY_SECONDS) -> dict[
     return ask(path, request)
 
 
+def ask_refusal(path: Path) -> DoraSystemdError | None:
+    """The error that a start of the dataflow of the runner at `path` would end with, or None.
+
+    Raises DoraSystemdError if the runner does not say.
+    """
+    reply = order(path, {"verb": "check"})
+    refused = reply.get("refused")
+    if refused is not None and not isinstance(refused, dict):
+        raise _unreadable(path)
+    return _error(path, refused) if refused else None
+
+
+def refused_reply(error: DoraSystemdError | None) -> dict[str, Any]:
+    """The answer that ask_refusal() reads."""
+    return {"refused": error_reply(error) if error else None}
+
+
+def error_reply(error: DoraSystemdError) -> dict[str, Any]:
+    """An error, in an answer."""
+    return {"error": error.message, "hint": error.hint, "code": int(error.code)}
+
+
 def ask_coordinator(path: Path) -> Coordinator:
     """The address of the coordinator of the runner at `path`. Raises DoraSystemdError."""
     reply = ask(path, {"verb": "coordinator"}, RELAY_SECONDS)
@@ -100,10 +122,15 @@ def _exchange(
     if not reply:
         raise _unreadable(path)
     if "error" in reply:
-        message, hint = (reply.get(key) for key in ("error", "hint"))
-        words = _words(message) or f"the runner of {path.parent.name} refuses that"
-        raise DoraSystemdError(words, _words(hint), _code(reply.get("code")))
+        raise _error(path, reply)
     return reply
+
+
+def _error(path: Path, reply: Request) -> DoraSystemdError:
+    """The error in an answer of the runner at `path`."""
+    message, hint = (reply.get(key) for key in ("error", "hint"))
+    words = _words(message) or f"the runner of {path.parent.name} refuses that"
+    return DoraSystemdError(words, _words(hint), _code(reply.get("code")))
 
 
 def _read_line(stream: socket.socket, deadline: float) -> bytes:

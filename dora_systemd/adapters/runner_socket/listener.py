@@ -11,7 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.runner_socket.address import listen
-from dora_systemd.adapters.runner_socket.client import MAX_BYTES, Request, parse_line
+from dora_systemd.adapters.runner_socket.client import (
+    MAX_BYTES,
+    Request,
+    error_reply,
+    parse_line,
+)
 from dora_systemd.adapters.runner_socket.splice import Ends, splice, taken_over
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
@@ -70,17 +75,17 @@ async def serve(
 
 async def _answer(request: Request | None, answer: Answer, reach: Reach) -> dict[str, Any]:
     if request is None:
-        return _refusal(DoraSystemdError("cannot read the request", "", ExitCode.USAGE))
+        return error_reply(DoraSystemdError("cannot read the request", "", ExitCode.USAGE))
     try:
         if request.get("verb") == "coordinator":
             return reach().raw()
         return await answer(request)
     except DoraSystemdError as error:
-        return _refusal(error)
+        return error_reply(error)
     except Exception as error:
         # A malformed request only ends its own connection.
         what = f"cannot do that: {type(error).__name__}: {error}"
-        return _refusal(DoraSystemdError(what, "please report it"))
+        return error_reply(DoraSystemdError(what, "please report it"))
 
 
 async def _relay(caller: Ends, reach: Reach) -> None:
@@ -92,7 +97,7 @@ async def _relay(caller: Ends, reach: Reach) -> None:
         message = "cannot reach the dora coordinator"
         own = error if isinstance(error, DoraSystemdError) else None
         lost = own or DoraSystemdError(f"{message}: {words_of(error)}", hint, ExitCode.NOT_RUNNING)
-        await _send(caller.writer, _refusal(lost))
+        await _send(caller.writer, error_reply(lost))
         return
     await _send(caller.writer, {"token": coordinator.token})
     await splice(caller, there)
@@ -100,13 +105,9 @@ async def _relay(caller: Ends, reach: Reach) -> None:
 
 async def refuse(caller: Ends, error: DoraSystemdError) -> None:
     """Answer with an error, instead of a session."""
-    await _send(caller.writer, _refusal(error))
+    await _send(caller.writer, error_reply(error))
 
 
 async def _send(writer: asyncio.StreamWriter, reply: Mapping[str, Any]) -> None:
     writer.write(json.dumps(reply).encode() + b"\n")
     await writer.drain()
-
-
-def _refusal(error: DoraSystemdError) -> dict[str, Any]:
-    return {"error": error.message, "hint": error.hint, "code": int(error.code)}

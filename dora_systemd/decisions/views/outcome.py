@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import Named
 
 DONE, UNCHANGED, FAILED = "done", "unchanged", "failed"
@@ -31,7 +31,7 @@ class Outcome:
     """The result for one dataflow or Thing.
 
     problem: "" for success. is_news: whether anything had to be done. details: what else a program
-    may need, by key.
+    may need, by key. hint, code: as in DoraSystemdError, of a problem.
     """
 
     subject: Subject
@@ -40,6 +40,18 @@ class Outcome:
     is_news: bool = True
     node: str = ""
     details: Mapping[str, Any] = field(default_factory=dict)
+    hint: str = ""
+    code: ExitCode = ExitCode.FAILURE
+
+    @classmethod
+    def of_error(cls, subject: Subject, error: DoraSystemdError) -> "Outcome":
+        """The result for a dataflow with which the error has prevented everything."""
+        return cls(subject, "", error.message, hint=error.hint, code=error.code)
+
+    @property
+    def error(self) -> DoraSystemdError | None:
+        """The problem as an error."""
+        return DoraSystemdError(self.problem, self.hint, self.code) if self.problem else None
 
 
 def outcome_object(one: Outcome, action: str) -> dict[str, Any]:
@@ -56,5 +68,5 @@ def outcome_object(one: Outcome, action: str) -> dict[str, Any]:
         "result": result,
         "text": one.text.strip().partition("\n")[0] or None,
         "details": dict(one.details),
-        "error": error_object(DoraSystemdError(one.problem)) if one.problem else None,
+        "error": error_object(one.error) if one.error else None,
     }

@@ -20,7 +20,8 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import uninhibited
-from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
+from dora_systemd.verbs.restart import require_startable, restart_cells
+from dora_systemd.verbs.stop import note_stop, stop_cells
 
 _FORCE_SECONDS = 0.2
 """Time for systemd to begin the stop: a kill before that would count as a failure."""
@@ -52,11 +53,18 @@ async def restart(talk: Talk, request: Request) -> dict[str, Any]:
         # Before the time of `_within` begins, which ends in a kill.
         await asyncio.to_thread(_hold, held, scope, cell)
         await asyncio.to_thread(refuse_parts, [cell], "restart")
-        await asyncio.to_thread(note_stop, [cell], "dora restart")
-        outcome = await _within(scope, cell, request, lambda: restart_cells(Bus(scope), [cell])[0])
+        await asyncio.to_thread(require_startable, scope, cell)
+        outcome = await _within(scope, cell, request, lambda: _restart(scope, cell))
     if outcome.problem:
-        raise DoraSystemdError(outcome.problem, f"doractl {scope.flag} why {cell.name} tells more")
+        hint = outcome.hint or f"doractl {scope.flag} why {cell.name} tells more"
+        raise DoraSystemdError(outcome.problem, hint)
     return {"DataflowRestarted": {"old_uuid": cell.uuid, "new_uuid": cell.uuid}}
+
+
+def _restart(scope: Scope, cell: Cell) -> Outcome:
+    """Restart a dataflow that has been checked."""
+    (outcome,) = restart_cells(Bus(scope), scope, [cell], "dora restart", is_forced=True)
+    return outcome
 
 
 def _hold(held: ExitStack, scope: Scope, cell: Cell) -> None:

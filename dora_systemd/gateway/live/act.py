@@ -20,10 +20,10 @@ from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import require_uninhibited
 from dora_systemd.verbs.node import ask_coordinator
 from dora_systemd.verbs.reload import reload_cell, switch_hot_reload
-from dora_systemd.verbs.restart import restart_asked
 from dora_systemd.verbs.set import set_limits
 from dora_systemd.verbs.start.again import find_start
 from dora_systemd.verbs.start.enable import disable_cell, enable_cell
+from dora_systemd.verbs.start.launch import restart_asked
 from dora_systemd.verbs.start.linger import ensure_linger
 
 _BY = "status page"

@@ -56,6 +56,9 @@ class Alone:
         """The dataflow with this machine's nodes."""
         return dataflow
 
+    def check(self, dataflow: Dataflow) -> None:
+        """Raise DoraSystemdError for a dataflow that this machine would refuse at a start."""
+
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """The dataflow has been read, and its run begins. Raises DoraSystemdError."""
 

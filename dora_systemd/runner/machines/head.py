@@ -21,6 +21,7 @@ from dora_systemd.adapters.runner_socket.listener import Session, refuse
 from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.cell.machines import members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
@@ -92,9 +93,13 @@ class Head(Shared):
         message = f"cannot reload {name}: it runs on several machines"
         await refuse(ends, DoraSystemdError(message, f"run: doractl restart {name}"))
 
+    def check(self, dataflow: Dataflow) -> None:
+        """Raise DoraSystemdError for a node that cannot run on its machine."""
+        check_placed(self.options, dataflow)
+
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Note what the members have to compare."""
-        check_placed(self.options, prepared.dataflow)
+        self.check(prepared.dataflow)
         content = Path(self.options.dataflow).read_bytes()
         # Who has written a unit file may not be there when a boot starts it.
         is_by_hand = is_transient(self.options.name, paths.is_of_user)

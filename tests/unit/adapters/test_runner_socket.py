@@ -16,7 +16,15 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.runner_socket.client import ask, ask_coordinator, done_of, order, relay
+from dora_systemd.adapters.runner_socket.client import (
+    ask,
+    ask_coordinator,
+    ask_refusal,
+    done_of,
+    order,
+    refused_reply,
+    relay,
+)
 from dora_systemd.adapters.runner_socket.listener import serve
 from dora_systemd.adapters.runner_socket.relay import open_port
 from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator
@@ -29,7 +37,12 @@ def nowhere() -> Coordinator:
     raise DoraSystemdError("cannot reach it", "wait", ExitCode.NOT_RUNNING)
 
 
+REFUSAL = DoraSystemdError("cannot use \33[1mrobot.yml", "mend it", ExitCode.BAD_INPUT)
+
+
 async def answer(request: Mapping[str, Any]) -> dict[str, Any]:
+    if request.get("verb") == "check":
+        return refused_reply(REFUSAL)
     if request.get("verb") == "broken":
         raise KeyError("node")
     if request.get("verb") == "no":
@@ -108,6 +121,15 @@ def test_an_order_for_a_runner_that_is_silent(tmp_path: Path) -> None:
         with pytest.raises(DoraSystemdError, match="timed out") as caught:
             order(path, {"verb": "reload"}, 0.05)
     assert caught.value.code == ExitCode.NOT_RUNNING
+
+
+def test_a_runner_whose_dataflow_could_not_start_again(tmp_path: Path) -> None:
+    with runner(path := tmp_path / "runner.sock", None):
+        found = ask_refusal(path)
+    assert found
+    assert "\33" not in found.message
+    assert (found.hint, found.code) == (REFUSAL.hint, REFUSAL.code)
+    assert refused_reply(None) == {"refused": None}
 
 
 def test_nobody_there(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ LATE = {
         "cli.remote.dispatch": {"cli.remote.rollout"},
     },
     "a restart of what runs makes no plan": {
-        "cli.verbs.run.restart": {"verbs.restart"},
+        "cli.verbs.run.restart": {"verbs.start.launch"},
     },
     "only a wrong command line needs a similar command, or the names of dataflows": {
         "cli.group": {"difflib", "adapters.bus.systemd", "verbs.facts.cells"},

@@ -1,4 +1,4 @@
-"""doractl stop, restart and reset, and what is left of restarts."""
+"""doractl stop and reset, and what is left of restarts."""
 
 import os
 import pwd
@@ -21,7 +21,6 @@ from dora_systemd.verbs.facts.reason import failure_reason
 from dora_systemd.verbs.start.asked import caller
 from dora_systemd.verbs.stop import (
     reset_cells,
-    restart_cells,
     stop_cells,
     stop_cells_within,
 )
@@ -96,21 +95,6 @@ def test_stop_that_was_cancelled() -> None:
     manager.job_results[UNIT] = "canceled"
     (outcome,) = stop_cells(manager, SCOPE, read_cells(manager))
     assert outcome.problem == f"cannot stop {UNIT}: the job was canceled"
-
-
-def test_restart() -> None:
-    manager = FakeManager()
-    manager.add(options(), active="failed")
-    (outcome,) = restart_cells(manager, read_cells(manager))
-    assert outcome.text == f"Dataflow restarted: {UUID} (robot)"
-
-
-def test_restart_that_fails() -> None:
-    manager = FakeManager()
-    manager.add(options(), StatusText="node camera failed", ExecMainStatus=1)
-    manager.job_results[UNIT] = "failed"
-    (outcome,) = restart_cells(manager, read_cells(manager))
-    assert outcome.problem == f"cannot restart {UNIT}: node camera failed (exit code 1)"
 
 
 @pytest.mark.parametrize(

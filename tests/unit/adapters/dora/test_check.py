@@ -56,15 +56,24 @@ def test_a_variable_that_is_not_set_is_named(options: RunnerOptions) -> None:
     assert caught.value.hint.startswith("set the variable by --env")
 
 
-@pytest.mark.parametrize("is_ours_refused", [False, True])
-def test_what_dora_refuses_comes_before_what_we_refuse(
-    options: RunnerOptions, is_ours_refused: bool
-) -> None:
+def test_what_we_refuse_comes_before_what_dora_refuses(options: RunnerOptions) -> None:
+    """doractl says the same of the same file before a start."""
+
     def prepare() -> None:
-        if is_ours_refused:
-            raise DoraSystemdError("ours")
+        raise DoraSystemdError("ours")
 
     Path(options.dataflow).write_text("refused")
     check = DoraCheck(options, os.environ, lambda: True)
+    with pytest.raises(DoraSystemdError, match="ours"):
+        check.beside(prepare)
     with pytest.raises(DoraSystemdError, match="it is refused"):
+        check.beside(lambda: 7)
+
+
+def test_without_dora_nothing_else_matters(options: RunnerOptions) -> None:
+    def prepare() -> None:
+        raise DoraSystemdError("ours")
+
+    check = DoraCheck(options, os.environ, lambda: False)
+    with pytest.raises(DoraSystemdError, match=r"it is dora 0\.4\.1"):
         check.beside(prepare)

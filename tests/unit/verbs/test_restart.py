@@ -1,0 +1,82 @@
+"""doractl restart: what could not start again keeps running, and a failure is reported."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.restart import Ask, require_startable, restart_cells
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+
+UNIT = "dora-robot.service"
+SCOPE = ScopeIn(is_user=True, uid=1000)
+BY = "doractl restart"
+REFUSAL = DoraSystemdError("cannot use /srv/robot.yml: it is odd", "mend it", ExitCode.BAD_INPUT)
+
+
+def accept(_: Path) -> DoraSystemdError | None:
+    return None
+
+
+def refuse(_: Path) -> DoraSystemdError | None:
+    return REFUSAL
+
+
+def say_nothing(path: Path) -> DoraSystemdError | None:
+    raise DoraSystemdError(f"cannot reach {path}", "", ExitCode.NOT_RUNNING)
+
+
+@pytest.fixture
+def manager() -> FakeManager:
+    manager = FakeManager()
+    manager.add(options())
+    return manager
+
+
+@pytest.mark.parametrize("ask", [accept, say_nothing])
+@pytest.mark.parametrize("active", ["active", "activating", "failed"])
+def test_restart(manager: FakeManager, active: str, ask: Ask) -> None:
+    manager.units[UNIT]["ActiveState"] = active
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=ask)
+    assert outcome.text == f"Dataflow restarted: {UUID} (robot)"
+    assert ("RestartUnit", UNIT) in manager.calls
+
+
+def test_restart_that_fails(manager: FakeManager) -> None:
+    manager.units[UNIT] |= {"StatusText": "node camera failed", "ExecMainStatus": 1}
+    manager.job_results[UNIT] = "failed"
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
+    assert outcome.problem == f"cannot restart {UNIT}: node camera failed (exit code 1)"
+
+
+def test_what_could_not_start_again_keeps_running(manager: FakeManager) -> None:
+    manager.add(options("vision", UUID.replace("5", "6")))
+
+    def ask(path: Path) -> DoraSystemdError | None:
+        return REFUSAL if path.parent.name == "robot" else None
+
+    robot, vision = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=ask)
+    assert vision.text
+    assert (robot.problem, robot.code) == (REFUSAL.message, REFUSAL.code)
+    assert robot.hint == (
+        "mend it, robot keeps running; doractl restart --force robot restarts it anyway"
+    )
+    assert [call for call in manager.calls if UNIT in call] == []
+
+
+@pytest.mark.parametrize("change", ["forced", "failed"])
+def test_what_is_not_asked(manager: FakeManager, change: str) -> None:
+    """Nothing is lost by the restart of what does not run."""
+    manager.units[UNIT]["ActiveState"] = "failed" if change == "failed" else "active"
+    is_forced = change == "forced"
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, is_forced, ask=refuse)
+    assert outcome.text
+
+
+def test_the_same_as_an_exception(manager: FakeManager) -> None:
+    (cell,) = read_cells(manager)
+    require_startable(SCOPE, cell, accept)
+    with pytest.raises(DoraSystemdError, match="it is odd") as caught:
+        require_startable(SCOPE, cell, refuse)
+    assert caught.value.code is ExitCode.BAD_INPUT
