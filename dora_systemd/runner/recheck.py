@@ -48,4 +48,4 @@ class Recheck:
         role.check(prepared.dataflow)
         here = replace(prepared, dataflow=role.here(prepared.dataflow))
         files = Sources(options, self._environment).files(here)
-        check_programs(sorted(files - {options.dataflow}))
+        check_programs(sorted(frozenset().union(*files.values())))

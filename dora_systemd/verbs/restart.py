@@ -13,7 +13,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.reason import job_reason
 from dora_systemd.verbs.node import socket_of
-from dora_systemd.verbs.stop import note_stop
+from dora_systemd.verbs.stop import THAWED, note_stop
 
 Ask = Callable[[Path], DoraSystemdError | None]
 """The error with which the runner at a path would refuse to start again."""
@@ -33,6 +33,7 @@ def restart_cells(
     A dataflow that could not start again keeps running, unless is_forced. by: what requests the
     restart, for the journal. The restart resets the counter of automatic restarts.
     """
+    thawed = {cell for cell in cells if manager.thaw(cell.unit)}  # a frozen runner answers nothing
     refused = {} if is_forced else find_refusals(scope, cells, ask)
     chosen = [cell for cell in cells if cell not in refused]
     note_stop(chosen, by)
@@ -43,7 +44,7 @@ def restart_cells(
     return [
         Outcome.of_error(cell, refused[cell])
         if cell in refused
-        else _outcome(manager, cell, results[cell.unit])
+        else _outcome(manager, cell, results[cell.unit], cell in thawed)
         for cell in cells
     ]
 
@@ -78,8 +79,9 @@ def _find_refusal(scope: Scope, cell: Cell, ask: Ask) -> DoraSystemdError | None
     return DoraSystemdError(error.message, hint, error.code)
 
 
-def _outcome(manager: Manager, cell: Cell, result: str) -> Outcome:
+def _outcome(manager: Manager, cell: Cell, result: str, was_frozen: bool) -> Outcome:
     if result == JOB_DONE:
-        return Outcome(cell, f"Dataflow restarted: {cell.uuid} ({cell.name})")
+        note = f": {THAWED}" if was_frozen else ""
+        return Outcome(cell, f"Dataflow restarted: {cell.uuid} ({cell.name}){note}")
     reason = job_reason(manager, cell.unit, result)
     return Outcome(cell, "", f"cannot restart {cell.unit}: {reason}")

@@ -4,7 +4,7 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager, Observer, is_at_rest
@@ -27,6 +27,8 @@ _MICROSECOND_NS = 1000
 KILLED_SECONDS = 10.0
 """Timeout for the end of processes that were killed."""
 POLL_SECONDS = 0.05
+THAWED = "thawed first, it was frozen"
+"""Note of what was frozen: systemd refuses to stop it, and may hang if it is killed."""
 
 Clock = Callable[[], float]
 
@@ -47,6 +49,7 @@ class _Stop:
     cell: Cell
     deadline: float
     is_killed: bool
+    was_frozen: bool = False
 
 
 def stop_cells(
@@ -57,10 +60,12 @@ def stop_cells(
     Each has its own grace duration; after that systemd kills what is left.
     """
     up = [cell.unit for cell in cells if cell.is_up]
+    thawed = {unit for unit in up if manager.thaw(unit)}
     begin = time.time_ns() // _MICROSECOND_NS
     results = manager.run_jobs("StopUnit", up, observer) if up else {}
     outcomes = [
-        _stop_outcome(manager, scope, cell, results.get(cell.unit), begin) for cell in cells
+        _stop_outcome(manager, scope, cell, results.get(cell.unit), begin, cell.unit in thawed)
+        for cell in cells
     ]
     end_links_of(manager, cells)
     release_enabled(manager, scope, up)
@@ -102,7 +107,8 @@ def stop_within(
             elif now() < one.deadline:
                 left.append(one)
             elif not one.is_killed:
-                left.append(_begin(manager, one.cell, 0, now()))
+                again = _begin(manager, one.cell, 0, now())
+                left.append(replace(again, was_frozen=one.was_frozen))
             else:
                 text = f"cannot stop {one.cell.unit}: it is {state} although it was killed"
                 yield Ended(one.cell, problem=text)
@@ -200,7 +206,7 @@ def not_running(subject: Subject, state: str) -> Outcome:
 
 
 def _stop_outcome(
-    manager: Manager, scope: Scope, cell: Cell, result: str | None, begin: int
+    manager: Manager, scope: Scope, cell: Cell, result: str | None, begin: int, was_frozen: bool
 ) -> Outcome:
     """begin: of the stop, CLOCK_REALTIME µs."""
     if result is None:
@@ -210,7 +216,7 @@ def _stop_outcome(
     state = manager.read(cell.unit, ["ActiveState", "Result"])
     is_failed = state["ActiveState"] == "failed"
     note = failure_reason(manager, cell.unit) if is_failed else _killed(scope, cell, begin)
-    return Outcome(cell, _stopped(cell, note))
+    return Outcome(cell, _stopped(cell, _joined(THAWED if was_frozen else "", note)))
 
 
 def _killed(scope: Scope, cell: Cell, begin: int) -> str:
@@ -246,6 +252,7 @@ def _reset(manager: Manager, cell: Cell) -> Outcome:
 def _begin(manager: Manager, cell: Cell, most: int | None, now: float) -> _Stop:
     """Stop a dataflow in any state: the job replaces a start or restart that is queued."""
     given = manager.read(cell.unit, ["TimeoutStopUSec"])["TimeoutStopUSec"]
+    thawed = manager.thaw(cell.unit)
     manager.queue_job("StopUnit", cell.unit)
     seconds = given / SECOND if given and given != INFINITY else UNBOUNDED_SECONDS
     seconds += _MARGIN_SECONDS
@@ -254,8 +261,9 @@ def _begin(manager: Manager, cell: Cell, most: int | None, now: float) -> _Stop:
         with suppress(DoraSystemdError):
             manager.kill(cell.unit, signal.SIGKILL)
         # ExecStopPost= runs now, and systemd allows it the same time again.
-        return _Stop(cell, now + max(KILLED_SECONDS, seconds), True)
-    return _Stop(cell, now + (seconds if most is None else min(seconds, most / SECOND)), False)
+        return _Stop(cell, now + max(KILLED_SECONDS, seconds), True, thawed)
+    limit = seconds if most is None else min(seconds, most / SECOND)
+    return _Stop(cell, now + limit, False, thawed)
 
 
 def _ended(manager: Manager, one: _Stop, state: str) -> Ended:
@@ -266,4 +274,8 @@ def _ended(manager: Manager, one: _Stop, state: str) -> Ended:
         note = "killed"
     elif state == "failed":
         note = failure_reason(manager, one.cell.unit)
-    return Ended(one.cell, note)
+    return Ended(one.cell, _joined(THAWED if one.was_frozen else "", note))
+
+
+def _joined(*notes: str) -> str:
+    return ", ".join(filter(None, notes))

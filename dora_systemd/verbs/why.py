@@ -3,13 +3,14 @@
 from contextlib import suppress
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.past import Switch, completed, undone
-from dora_systemd.decisions.views.dataflows import DEGRADED, FAILED
+from dora_systemd.decisions.views.dataflows import DEGRADED, FAILED, FROZEN
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
 from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE
@@ -126,9 +127,11 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         return _held_facts(manager, cell)
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     nodes, spent = status.nodes.items(), node_table.spent(status.nodes)
-    unit = manager.read(cell.unit, ["StatusText", "NRestarts"])
+    unit = manager.read(cell.unit, ["StatusText", "NRestarts", "ControlGroup"])
+    group = unit["ControlGroup"]
+    is_frozen = bool(group) and cgroup.is_frozen(cgroup.group_path(group))
     return Facts(
-        cell.word(status.stage),
+        FROZEN if is_frozen else cell.word(status.stage),
         problem or str(unit["StatusText"]),
         {key: spent.get(key, str(node.exit)) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),

@@ -36,6 +36,20 @@ def test_stop(cell: Cell, project: Project) -> None:
     assert again.stdout == f"Dataflow not running: {started['uuid']} ({cell.name} stopped)\n"
 
 
+@pytest.mark.lab
+def test_what_is_frozen_is_shown_and_thawed_first(cell: Cell, project: Project) -> None:
+    """A kill of a frozen unit can hang systemd, and systemd refuses to stop it."""
+    cell.start(project.three_nodes())
+    for verb in ("restart", "stop"):
+        cell.systemctl("freeze")
+        assert "Status:   Frozen" in cell.doractl("list", cell.name).stdout
+        why = cell.doractl("why", cell.name).stdout
+        assert f"run: systemctl {cell.scope.flag} thaw {cell.unit}" in why
+        done = cell.doractl(verb, cell.name)
+        assert "thawed first, it was frozen" in done.stdout
+    assert cell.is_gone
+
+
 def test_stop_what_is_not_there() -> None:
     done = run("doractl", "stop", "nothing-of-that-name", check=False)
     assert done.returncode == ExitCode.NOT_FOUND

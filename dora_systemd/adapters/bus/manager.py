@@ -73,7 +73,10 @@ class Manager(Protocol):
     def run_jobs(
         self, method: str, units: Sequence[str], observer: Observer | None = None
     ) -> dict[str, str]:
-        """StartUnit, StopUnit or RestartUnit for all units in parallel; the result of each job."""
+        """StartUnit, StopUnit or RestartUnit for all units in parallel; the result of each job.
+
+        What ends a unit thaws it first, see thaw().
+        """
 
     def queue_job(self, method: str, unit: str) -> str:
         """Queue a job for one unit without waiting; the object path of the job.
@@ -82,7 +85,14 @@ class Manager(Protocol):
         """
 
     def kill(self, unit: str, signal: int, whom: str = "all") -> None:
-        """Send `signal` to the processes of a unit: main, control or all."""
+        """Send `signal` to the processes of a unit: main, control or all. Thaws the unit first."""
+
+    def thaw(self, unit: str) -> bool:
+        """Thaw a unit that somebody has frozen, see `systemctl freeze`; whether it was frozen.
+
+        systemd refuses to stop a frozen unit. If its main process is killed, systemd 257 starts
+        ExecStopPost= in a frozen cgroup and waits for it forever: PID 1 hangs.
+        """
 
     def reset_failed(self, unit: str) -> None:
         """Clear the failed state of a unit; systemd then unloads a transient one."""

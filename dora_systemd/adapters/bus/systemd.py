@@ -34,13 +34,17 @@ BY_TYPE = {
 PROPERTIES = b"org.freedesktop.DBus.Properties"
 
 _IDLE_SECONDS = 1.0
+_ENDING = ("StopUnit", "RestartUnit")
+"""The jobs that end a unit."""
+_FROZEN = ("frozen", "freezing")
+_BY_PARENT = ("frozen-by-parent", "freezing-by-parent")
 _UNIT_PROPERTIES = frozenset(
     (
         *("ActiveState", "SubState", "LoadState", "FragmentPath", "DropInPaths", "Transient"),
         *("ActiveEnterTimestamp", "ActiveEnterTimestampMonotonic", "InactiveEnterTimestamp"),
         *("InactiveExitTimestamp", "InactiveExitTimestampMonotonic", "InvocationID", "Job"),
         *("StateChangeTimestamp", "Description", "UnitFileState", "NeedDaemonReload", "WantedBy"),
-        *("RequiredBy", "Requires"),
+        *("RequiredBy", "Requires", "FreezerState"),
         *("StateChangeTimestampMonotonic", "StartLimitBurst", "StartLimitIntervalUSec"),
     )
 )
@@ -92,6 +96,8 @@ class Bus:
         return self._wait_for_jobs(jobs, observer) | dict.fromkeys(gone, JOB_DONE)
 
     def queue_job(self, method: str, unit: str) -> str:
+        if method in _ENDING:
+            self.thaw(unit)
         self._listen(unit)
         action = f"{method.removesuffix('Unit').lower()} {unit}"
         try:
@@ -103,7 +109,19 @@ class Bus:
             return ""
 
     def kill(self, unit: str, signal: int, whom: str = "all") -> None:
+        self.thaw(unit)
         self._call(f"kill {unit}", "KillUnit", ("s", unit), ("s", whom), ("i", signal))
+
+    def thaw(self, unit: str) -> bool:
+        state = self._read_one(unit, "FreezerState")
+        if state in _BY_PARENT:
+            message = f"cannot use {unit}: a slice that contains it is frozen"
+            hint = f"run: systemctl {self.scope.flag} thaw {self._read_one(unit, 'Slice')}"
+            raise DoraSystemdError(message, hint)
+        is_frozen = state in _FROZEN
+        if is_frozen:
+            self._call(f"thaw {unit}", "ThawUnit", ("s", unit))
+        return is_frozen
 
     def reset_failed(self, unit: str) -> None:
         self._call(f"reset {unit}", "ResetFailedUnit", ("s", unit))

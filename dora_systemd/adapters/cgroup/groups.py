@@ -158,6 +158,11 @@ def is_populated(path: Path) -> bool:
     return "populated 1" in read_text(f"{path}/cgroup.events").splitlines()
 
 
+def is_frozen(path: Path) -> bool:
+    """Whether all processes of the group and of those below it are frozen, by it or from above."""
+    return "frozen 1" in read_text(f"{path}/cgroup.events").splitlines()
+
+
 def make_group(path: Path) -> None:
     """Create one group unless it exists. Raises OSError."""
     path.mkdir(exist_ok=True)

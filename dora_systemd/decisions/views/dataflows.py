@@ -10,10 +10,12 @@ from dora_systemd.values import SECOND, format_rounded_size
 
 STARTING, WAITING, RUNNING, DEGRADED = "Starting", "Waiting", "Running", "Degraded"
 STOPPING, RESTARTING = "Stopping", "Restarting"
+FROZEN = "Frozen"
+"""Somebody has frozen the unit, as by `systemctl freeze`."""
 FINISHED, STOPPED, FAILED = "Finished", "Stopped", "Failed"
 UNREACHABLE = "Unreachable"
 """In the place of a status: that of a host from which no answer came."""
-UP_WORDS = frozenset({STARTING, WAITING, RUNNING, DEGRADED, STOPPING, RESTARTING})
+UP_WORDS = frozenset({STARTING, WAITING, RUNNING, DEGRADED, STOPPING, RESTARTING, FROZEN})
 
 _BY_ACTIVE = {
     "active": RUNNING,
@@ -115,7 +117,7 @@ _UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
 STATE_COLORS = {
     **dict.fromkeys((FAILED, UNREACHABLE), "red"),
     **dict.fromkeys(
-        (STARTING, WAITING, DEGRADED, STOPPING, RESTARTING, SILENT, "Reloading"), "yellow"
+        (STARTING, WAITING, DEGRADED, STOPPING, RESTARTING, FROZEN, SILENT, "Reloading"), "yellow"
     ),
 }
 """By the word for a state, as in systemctl(1); others have none."""

@@ -7,6 +7,7 @@ from dora_systemd.decisions.views.dataflows import (
     DEGRADED,
     FAILED,
     FINISHED,
+    FROZEN,
     RESTARTING,
     STARTING,
     STOPPED,
@@ -22,7 +23,7 @@ STATUSES: Mapping[str, frozenset[str]] = {
     "failed": frozenset({FAILED}),
     **{
         word.lower(): frozenset({word})
-        for word in (STARTING, WAITING, DEGRADED, STOPPING, RESTARTING, STOPPED)
+        for word in (STARTING, WAITING, DEGRADED, STOPPING, RESTARTING, FROZEN, STOPPED)
     },
 }
 """The values of --status: dora's three, which leave out none, and other words of the table."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.views.dataflows import WAITING
+from dora_systemd.decisions.views.dataflows import FROZEN, WAITING
 from dora_systemd.decisions.why.verdict import Verdict
 
 _AUTOMATIC = "run: doractl restart {name}; --restart-policy on-failure does this automatically"
@@ -53,11 +53,14 @@ _SIGNAL_REMEDIES: Mapping[int, str] = {
         "fix {node}; coredumpctl info {pid} shows where it crashed",
     ),
 }
+_THAW = "somebody has frozen the unit; run: systemctl {flag} thaw {unit}"
 _GATHERING = "nothing: it starts when all machines are there; doractl stop {name} gives up"
 
 
 def remedy_of(verdict: Verdict) -> str:
     """The remedy, with names in braces that the report fills in; "" for none."""
+    if verdict.status == FROZEN:
+        return _THAW
     if verdict.cause is Cause.MACHINE_LOST and verdict.status == WAITING:
         return _GATHERING
     if verdict.cause in (Cause.NODE_OUT_OF_MEMORY, Cause.OUT_OF_MEMORY):

@@ -66,7 +66,7 @@ export const tone = (state) => TONES[state.toLowerCase()] ?? "calm";
 
 export const titled = (state) => state.charAt(0).toUpperCase() + state.slice(1);
 
-const FIRST = ["Failed", "Degraded", "Restarting"];
+const FIRST = ["Failed", "Degraded", "Restarting", "Frozen"];
 
 /** For sort(): what needs a hand comes first, the rest by name. */
 export function byNeed(a, b) {
@@ -74,7 +74,7 @@ export function byNeed(a, b) {
   return rank(a) - rank(b) || (a.name < b.name ? -1 : 1);
 }
 
-const UP = ["Starting", "Waiting", "Running", "Degraded", "Stopping", "Restarting"];
+const UP = ["Starting", "Waiting", "Running", "Degraded", "Stopping", "Restarting", "Frozen"];
 export const isUp = (dataflow) => UP.includes(dataflow.status);
 
 const TIMES = { millis: "ms", secs: "s", micros: "µs", nanos: "ns" };

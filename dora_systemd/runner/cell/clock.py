@@ -1,7 +1,9 @@
-"""The clock of a stop: every step at the end asks it how long it may take."""
+"""The clock of a stop, which every step at the end asks how long it may take; and lost time."""
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from dora_systemd.decisions.life.stop_budget import runner_timeout
 from dora_systemd.values import INFINITY, SECOND
@@ -10,6 +12,36 @@ STOP_SECONDS = 7.0
 BACKLOG_SECONDS = 60.0
 """Timeouts for journald to take what the nodes have written: when a stop was requested, and when
 none was."""
+
+RECOVERY_SECONDS = 40.0
+"""Time for dora's daemon to register again after its coordinator has missed it. Measured: dora
+gives it up after 20 to 30 s, and has it back within seconds, with all nodes."""
+_SLACK_SECONDS = 2.0
+"""A block that takes so much longer than it may was not running, or had no CPU time."""
+
+
+class Gaps:
+    """Notices that this process did not run for a while, as when its unit was frozen.
+
+    now: seconds of a clock that goes on meanwhile.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._until = -math.inf
+
+    @contextmanager
+    def within(self, seconds: float) -> Iterator[None]:
+        """A block that takes at most `seconds`, unless this process does not run."""
+        begun = self._now()
+        yield
+        if self._now() - begun > seconds + _SLACK_SECONDS:
+            self._until = self._now() + RECOVERY_SECONDS
+
+    @property
+    def is_recent(self) -> bool:
+        """Whether the process did not run a short time ago: what it waits for may need time."""
+        return self._now() < self._until
 
 
 class StopClock:

@@ -21,6 +21,7 @@ from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.rights.node_rights import is_essential
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.clock import Gaps
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks, failed
 from dora_systemd.runner.cell.pump import Pump, now_us
@@ -37,8 +38,6 @@ _AGAIN_SECONDS = 0.02
 _QUIET_SECONDS = 0.1
 _WAITING_SECONDS = 1.0
 """Time for the effect of a stop on other nodes to be seen, if there are any."""
-_LATE_SECONDS = 2.0
-"""How late the loop may be without being held up."""
 _LONG_SECONDS = 3600.0 * 24 * 365
 
 
@@ -253,17 +252,17 @@ class Dialogue(Tasks):
     async def watch_dora(self, seconds: float) -> None:
         """See every `seconds` that neither coordinator nor daemon hangs.
 
-        While the cell stops, TimeoutStopSec= bounds it. If this process itself had no time, or was
-        frozen, the answer may be there and unread: then dora is asked again in the next round.
+        While the cell stops, TimeoutStopSec= bounds it. After a time in which the cell did not run,
+        dora's processes have to find each other again.
         """
-        timeout, clock = 1.5 * seconds, asyncio.get_running_loop().time
+        gaps = Gaps(self._loop.time)
         while True:
-            begun = clock()
-            await asyncio.sleep(seconds)
-            if self._pump.cell.state is State.RUNNING:
-                silent = await self._engine.find_silent(timeout)
-                is_late = clock() - begun > seconds + timeout + _LATE_SECONDS
-                if silent and not is_late and self._pump.cell.state is State.RUNNING:
+            with gaps.within(seconds):
+                await asyncio.sleep(seconds)
+            if self._pump.cell.state is State.RUNNING and not gaps.is_recent:
+                with gaps.within(1.5 * seconds):
+                    silent = await self._engine.find_silent(1.5 * seconds)
+                if silent and not gaps.is_recent and self._pump.cell.state is State.RUNNING:
                     reason = f"the dora {silent} does not answer any more"
                     self._pump.push(life.ConnectionLost(now_us(), silent, reason))
 

@@ -35,6 +35,7 @@ from dora_systemd.decisions.rights.node_rights import is_essential
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
+from dora_systemd.runner.cell.clock import Gaps
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import SILENCE, Engine
 from dora_systemd.runner.cell.life import Life, is_transient
@@ -250,8 +251,12 @@ class HeadDialogue(Dialogue):
 
     async def _watch_machines(self) -> None:
         """Find a member that is there, and whose daemon is not or hangs."""
+        gaps = Gaps(self._loop.time)
         while True:
-            await asyncio.sleep(_WATCH_SECONDS)
+            with gaps.within(_WATCH_SECONDS):
+                await asyncio.sleep(_WATCH_SECONDS)
+            if gaps.is_recent:
+                continue
             if self._pump.cell.state in (State.WAITING, State.RUNNING) and (
                 lost := await self._find_lost()
             ):

@@ -50,7 +50,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "uuid": cell.uuid,
         "name": cell.name,
         "unit": cell.unit,
-        "status": cell.word(status.stage),
+        "status": reading.word,
         "dataflow": cell.dataflow,
         "listed_release": cell.release,
         # The status says "failed" already.

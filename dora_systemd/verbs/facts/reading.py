@@ -13,6 +13,7 @@ from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.resources.usage import Usage
+from dora_systemd.decisions.views.dataflows import FROZEN
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
@@ -37,7 +38,8 @@ class Reading(NamedTuple):
     unit: properties of its unit. problem: why its node table is not usable, or "". groups, usage:
     by node, with the unit's own as WHOLE_CELL; empty for a dataflow that is not running. at_us:
     time of the reading, CLOCK_MONOTONIC. heard: the last message of each owed output, on the same
-    clock, 0 is never. held: what systemd waits for before it starts it.
+    clock, 0 is never. held: what systemd waits for before it starts it. is_frozen: whether
+    somebody has frozen the unit.
     """
 
     cell: Cell
@@ -49,6 +51,12 @@ class Reading(NamedTuple):
     at_us: int = 0
     heard: tuple[int, ...] = ()
     held: "Held | None" = None
+    is_frozen: bool = False
+
+    @property
+    def word(self) -> str:
+        """The status of the dataflow in one word."""
+        return FROZEN if self.is_frozen else self.cell.word(self.status.stage)
 
     @property
     def sample(self) -> CpuSample:
@@ -100,7 +108,8 @@ def read_dataflow(
     groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
     heard = () if is_row else read_heard(scope, cell.name, cell.options.owes)
-    return Reading(cell, unit, status, problem, groups, usage, _monotonic_us(), heard)
+    read = Reading(cell, unit, status, problem, groups, usage, _monotonic_us(), heard)
+    return read._replace(is_frozen=cgroup.is_frozen(path))
 
 
 def _read_held(manager: Manager, cell: Cell) -> Reading:

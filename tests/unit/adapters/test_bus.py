@@ -157,6 +157,45 @@ def test_a_unit_that_is_gone_is_stopped() -> None:
         Departing(ExitCode.NO_PERMISSION).run_jobs("StopUnit", ["gone"])
 
 
+class Freezer(bus.Bus):
+    """A unit in a state of its freezer; the methods that were called."""
+
+    def __init__(self, state: str) -> None:
+        self.scope = SYSTEM
+        self.state = state
+        self.called: list[str] = []
+
+    def _listen(self, unit: str) -> None:
+        del unit
+
+    def _call(self, action: str, method: str, *arguments: Any, **more: Any) -> str:
+        del action, more
+        if method != "Get":
+            self.called.append(method)
+            return "/job/1"
+        return self.state if arguments[1][1] == "FreezerState" else "dora.slice"
+
+
+@pytest.mark.parametrize("state", ["running", "frozen"])
+def test_nothing_frozen_is_stopped_or_killed(state: str) -> None:
+    systemd = Freezer(state)
+    thaw = ["ThawUnit"] if state == "frozen" else []
+    systemd.queue_job("StopUnit", "x.service")
+    systemd.queue_job("RestartUnit", "x.service")
+    systemd.kill("x.service", 9)
+    assert systemd.called == [*thaw, "StopUnit", *thaw, "RestartUnit", *thaw, "KillUnit"]
+    systemd.queue_job("StartUnit", "x.service")
+    assert systemd.called[-2:] == ["KillUnit", "StartUnit"]
+
+
+def test_a_frozen_slice_is_left_to_its_owner() -> None:
+    systemd = Freezer("frozen-by-parent")
+    with pytest.raises(DoraSystemdError, match="slice that contains it is frozen") as caught:
+        systemd.queue_job("StopUnit", "x.service")
+    assert caught.value.hint == "run: systemctl --system thaw dora.slice"
+    assert not systemd.called
+
+
 def test_other_errors_pass() -> None:
     with pytest.raises(ZeroDivisionError), bus_errors.explained("do it", SYSTEM):
         raise ZeroDivisionError

@@ -129,6 +129,12 @@ def test_populated(unit: Path) -> None:
     assert cgroup.is_populated(unit)
 
 
+def test_frozen(unit: Path) -> None:
+    assert not cgroup.is_frozen(unit)
+    (unit / "cgroup.events").write_text("populated 1\nfrozen 1\n")
+    assert cgroup.is_frozen(unit)
+
+
 def test_processes_are_killed_one_by_one_without_cgroup_kill(unit: Path) -> None:
     child = os.posix_spawn("/bin/sleep", ["sleep", "100"], {})
     (unit / "node-camera" / "cgroup.procs").write_text(f"{child}\n")

@@ -137,6 +137,11 @@ class FakeManager:
     def kill(self, unit: str, signal: int, whom: str = "all") -> None:
         self.calls.append(("kill", unit, signal, whom))
 
+    def thaw(self, unit: str) -> bool:
+        is_frozen = bool(self.units.get(unit, {}).pop("FreezerState", ""))
+        self.calls += [("thaw", unit)] if is_frozen else []
+        return is_frozen
+
     def reset_failed(self, unit: str) -> None:
         if unit not in self.units:
             raise DoraSystemdError(f"cannot reset {unit}", "", ExitCode.NOT_FOUND)

@@ -80,3 +80,14 @@ def test_the_same_as_an_exception(manager: FakeManager) -> None:
     with pytest.raises(DoraSystemdError, match="it is odd") as caught:
         require_startable(SCOPE, cell, refuse)
     assert caught.value.code is ExitCode.BAD_INPUT
+
+
+def test_what_is_frozen_is_thawed_before_it_is_asked(manager: FakeManager) -> None:
+    manager.units[UNIT]["FreezerState"] = "frozen"
+
+    def ask(_: Path) -> DoraSystemdError | None:
+        assert manager.calls == [("thaw", UNIT)]
+        return None
+
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=ask)
+    assert outcome.text.endswith("(robot): thawed first, it was frozen")

@@ -89,6 +89,20 @@ def test_stop_by_force() -> None:
     assert stop_cells_within(manager, SCOPE, cells, SECOND)[0].text.endswith("(robot)")
 
 
+@pytest.mark.parametrize("most", [None, 0, SECOND])
+def test_what_is_frozen_is_thawed_before_it_is_stopped(most: int | None) -> None:
+    manager = FakeManager()
+    manager.add(options(), FreezerState="frozen")
+    cells = read_cells(manager)
+    if most is None:
+        (outcome,) = stop_cells(manager, SCOPE, cells)
+    else:
+        manager.units[UNIT]["ActiveState"] = "inactive"  # as soon as it is told to stop
+        (outcome,) = stop_cells_within(manager, SCOPE, cells, most)
+    assert [call[0] for call in manager.calls][:2] == ["thaw", "StopUnit"]
+    assert "(robot): thawed first, it was frozen" in outcome.text
+
+
 def test_stop_that_was_cancelled() -> None:
     manager = FakeManager()
     manager.add(options())

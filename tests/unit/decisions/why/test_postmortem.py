@@ -416,6 +416,11 @@ def test_remedies(exit: str, owner: str, words: str) -> None:
     assert words in text.partition("What to do:")[2]
 
 
+def test_what_is_frozen_has_to_be_thawed() -> None:
+    text = format_report(Report(SUBJECT, judge(*RUNS, facts=Facts("Frozen", "2/2 nodes running"))))
+    assert "systemctl --system thaw dora-robot.service" in text.partition("What to do:")[2]
+
+
 def test_one_that_is_gone_is_started_anew() -> None:
     gone = Subject(UUID, "robot", "dora-robot.service", "--user")
     text = format_report(Report(gone, judge(*RUNS, CRASH, NODE_FAILED)))

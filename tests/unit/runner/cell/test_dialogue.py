@@ -292,8 +292,8 @@ def test_dora_is_watched(
     live(work)
 
 
-def test_an_answer_that_was_not_read_in_time_proves_nothing(tmp_path: Path) -> None:
-    """The runner was held up, or frozen, and dora perhaps not."""
+def test_a_cell_that_was_frozen_gives_dora_time(tmp_path: Path) -> None:
+    """dora's coordinator has missed the daemon meanwhile, which registers again."""
 
     async def work() -> None:
         bench = Bench(tmp_path, State.RUNNING)
@@ -302,11 +302,10 @@ def test_an_answer_that_was_not_read_in_time_proves_nothing(tmp_path: Path) -> N
         bench.dialogue.spawn("watch dora", bench.dialogue.watch_dora(10))
         await asyncio.sleep(9)
         loop.jump(40)
-        await asyncio.sleep(5)
-        assert ("find silent", 15.0) in bench.calls
+        await asyncio.sleep(35)
         assert not bench.heard
-        await asyncio.sleep(10)
-        assert len(bench.heard) == 1
+        await asyncio.sleep(20)
+        assert bench.heard
         bench.dialogue.cancel()
 
     live(work)

@@ -99,6 +99,15 @@ def test_running_dataflow(scope: Scope) -> None:
     assert (plot.exit, plot.memory, plot.cpu_percent) == ("exit code 1", None, None)
 
 
+def test_a_frozen_dataflow(scope: Scope, unit_group: Path) -> None:
+    (unit_group / "cgroup.events").write_text("populated 1\nfrozen 1\n")
+    manager = FakeManager()
+    manager.add(options(), ControlGroup=GROUP)
+    write_status(scope, CellStatus(nodes={"camera": NodeStatus("running", 42)}))
+    (line,) = table_of(manager, scope)
+    assert (row_of(manager, scope).status, line.status) == ("Frozen", "Frozen")
+
+
 @pytest.mark.parametrize("group", [GROUP, "/other.slice/dora-robot.service"])
 @pytest.mark.parametrize("active", ["active", "activating", "failed"])
 @pytest.mark.parametrize("has_samples", [True, False])
