@@ -25,6 +25,7 @@ from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.parts import CONTROL, refuse_parts
 from dora_systemd.verbs.facts.reading import read_status
+from dora_systemd.verbs.inhibit.guard import IfInhibited, Tell, require_uninhibited
 from dora_systemd.verbs.start.asked import caller
 
 _NO_USER = 2**32 - 1
@@ -98,15 +99,23 @@ class NodeOrder:
     grace: int | None = None
 
 
-def order_node(scope: Scope, cell: Cell, given: NodeOrder, ask: Ask = order) -> str:
+def order_node(
+    scope: Scope,
+    cell: Cell,
+    given: NodeOrder,
+    ask: Ask = order,
+    how: IfInhibited = IfInhibited.REFUSE,
+    tell: Tell | None = None,
+) -> str:
     """Have the runner restart or stop one node; what it does, for people.
 
     The runner records who has asked, and uses none of the restarts that the node's policy allows.
-    Raises DoraSystemdError.
+    how, tell: as for uninhibited(). Raises DoraSystemdError, also while a lock inhibits it.
     """
     require_running(cell)
     refuse_parts([cell], CONTROL)
     require_node(scope, cell, given.node)
+    require_uninhibited(scope, [cell], f"{given.what} node {given.node} of", how, tell)
     by = f"{caller(os.getuid(), os.environ)} ({given.by})"
     request = {"what": given.what, "node": given.node, "by": by, "grace": given.grace}
     path = socket_of(scope, cell)

@@ -134,6 +134,19 @@ def test_waiting_for_the_end_of_a_lock(cell: Cell, project: Project) -> None:
     assert cell.show("InvocationID") != before
 
 
+def test_a_lock_holds_back_what_ends_single_nodes_or_everything(
+    cell: Cell, project: Project
+) -> None:
+    cell.start(project.three_nodes())
+    with inhibiting(cell):
+        for action in ("restart", "stop"):
+            told = refused(cell, "node", action, cell.name, "sink")
+            assert f"cannot {action} node sink of {cell.name}: inhibited by" in told
+        assert f"cannot stop {cell.name}: inhibited by" in refused(cell, "destroy")
+    cell.doractl("destroy")
+    assert cell.is_gone
+
+
 def test_a_lock_outlasts_a_restart(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     with inhibiting(cell) as child:

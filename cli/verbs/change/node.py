@@ -3,6 +3,7 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import (
     acting_options,
     current_scope,
@@ -12,6 +13,7 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.decisions.cell.asked import RESTART, STOP
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.inhibit.guard import IfInhibited
 from dora_systemd.verbs.node import NodeOrder, order_node
 
 _DOORS = {RESTART: "doractl node restart", STOP: "doractl node stop"}
@@ -32,23 +34,26 @@ def command() -> None:
 @command.command("restart")
 @click.argument("selector")
 @click.argument("node")
+@inhibit_options
 @acting_options
-def restart(selector: str, node: str) -> int:
+def restart(selector: str, node: str, force: bool, wait: bool) -> int:
     """Restart NODE of the dataflow SELECTOR; it uses up none of its automatic restarts."""
-    return _order(selector, RESTART, node)
+    return _order(selector, RESTART, node, if_inhibited(force, wait))
 
 
 @command.command("stop")
 @click.argument("selector")
 @click.argument("node")
+@inhibit_options
 @acting_options
-def stop(selector: str, node: str) -> int:
+def stop(selector: str, node: str, force: bool, wait: bool) -> int:
     """Stop NODE of the dataflow SELECTOR until it is restarted; the other nodes keep running."""
-    return _order(selector, STOP, node)
+    return _order(selector, STOP, node, if_inhibited(force, wait))
 
 
-def _order(selector: str, what: str, node: str) -> int:
+def _order(selector: str, what: str, node: str, how: IfInhibited) -> int:
     scope = current_scope()
     cell = Selector(selector).find(Bus(scope))
-    done = order_node(scope, cell, NodeOrder(what, node, _DOORS[what]))
+    given = NodeOrder(what, node, _DOORS[what])
+    done = order_node(scope, cell, given, how=how, tell=TellWaiting())
     return print_outcomes([Outcome(cell, done, node=node)])

@@ -3,6 +3,7 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
 from dora_systemd.decisions.views.outcome import Outcome, Thing
 from dora_systemd.errors import ExitCode
@@ -18,17 +19,19 @@ from dora_systemd.verbs.destroy import (
 )
 from dora_systemd.verbs.facts.enabled import enabled_names
 from dora_systemd.verbs.gateway import read_gateway
+from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.stop import note_stop
 
 
 @click.command("destroy")
-@click.option("--force", is_flag=True, help="Kill the nodes, instead of telling them to stop.")
+@click.option("--force", is_flag=True, help="Kill the nodes at once, even if a lock inhibits it.")
+@click.option("--wait", is_flag=True, help="Wait while a lock inhibits it.")
 @acting_options
-def command(force: bool) -> int:
+def command(force: bool, wait: bool) -> int:
     """Stop all dataflows, the gateway and dora.slice, and check that no process is left.
 
     Only this scope is affected: the system's, or the calling user's. Enabled dataflows
-    stay enabled.
+    stay enabled. Refused while doractl inhibit or a node inhibits one of them.
 
     Examples:
       doractl destroy
@@ -36,7 +39,8 @@ def command(force: bool) -> int:
     """
     scope = current_scope()
     bus = Bus(scope)
-    is_good = _stop_dataflows(bus, scope, force)
+    with uninhibited(scope, running_cells(bus), "stop", if_inhibited(force, wait), TellWaiting()):
+        is_good = _stop_dataflows(bus, scope, force)
     drop_all_disabled(bus, scope)
     was_up = read_gateway(bus).is_up
     if was_up:
