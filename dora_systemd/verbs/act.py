@@ -9,6 +9,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
+from dora_systemd.verbs.needs.dependents import find_dependents
 from dora_systemd.verbs.node import NodeOrder, order_node
 from dora_systemd.verbs.restart import restart_cells
 from dora_systemd.verbs.stop import note_stop, stop_cells
@@ -34,13 +35,14 @@ def act_on(
     if node:
         return order_node(scope, cell, NodeOrder(action, node, by))
     observer = partial(tell_stage, on_stage)
+    cells = [cell, *find_dependents(manager, [cell])]
     if action == "stop":
-        note_stop([cell], by)
-        (outcome,) = stop_cells(manager, scope, [cell], observer)
-        return told(outcome)
-    with uninhibited(scope, [cell], "restart"):
-        (outcome,) = restart_cells(manager, scope, [cell], by, observer=observer)
-    return told(outcome)
+        note_stop(cells, by)
+        outcomes = stop_cells(manager, scope, cells, observer)
+    else:
+        with uninhibited(scope, cells, "restart"):
+            outcomes = restart_cells(manager, scope, cells, by, observer=observer)
+    return "; ".join(map(told, outcomes))
 
 
 def told(outcome: Outcome) -> str:

@@ -11,7 +11,7 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.reason import job_reason
+from dora_systemd.verbs.facts.reason import job_reason, need_failure, runners_refusal
 from dora_systemd.verbs.node import socket_of
 from dora_systemd.verbs.stop import THAWED, note_stop
 
@@ -44,7 +44,7 @@ def restart_cells(
     return [
         Outcome.of_error(cell, refused[cell])
         if cell in refused
-        else _outcome(manager, cell, results[cell.unit], cell in thawed)
+        else _outcome(manager, scope, cell, results[cell.unit], cell in thawed)
         for cell in cells
     ]
 
@@ -79,9 +79,16 @@ def _find_refusal(scope: Scope, cell: Cell, ask: Ask) -> DoraSystemdError | None
     return DoraSystemdError(error.message, hint, error.code)
 
 
-def _outcome(manager: Manager, cell: Cell, result: str, was_frozen: bool) -> Outcome:
+def _outcome(manager: Manager, scope: Scope, cell: Cell, result: str, was_frozen: bool) -> Outcome:
     if result == JOB_DONE:
         note = f": {THAWED}" if was_frozen else ""
         return Outcome(cell, f"Dataflow restarted: {cell.uuid} ({cell.name}){note}")
-    reason = job_reason(manager, cell.unit, result)
-    return Outcome(cell, "", f"cannot restart {cell.unit}: {reason}")
+    if result == "dependency":
+        needed = manager.read(cell.unit, ["Requires"])["Requires"] or ()
+        reason, more = need_failure(manager, scope.flag, needed)
+    elif refusal := runners_refusal(manager, cell.unit):
+        return Outcome.of_error(cell, refusal)
+    else:
+        reason = job_reason(manager, cell.unit, result)
+        more = f"doractl {scope.flag} why {cell.name}"
+    return Outcome(cell, "", f"cannot restart {cell.name}: {reason}", hint=f"{more} tells more")

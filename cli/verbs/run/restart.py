@@ -9,10 +9,11 @@ import click
 from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
-from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
+from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
+from dora_systemd.verbs.needs.dependents import find_dependents, format_dependents
 from dora_systemd.verbs.restart import restart_cells
 from dora_systemd.verbs.start.again import find_known
 
@@ -37,6 +38,9 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
     bus = Bus(scope)
     cells, ended = find_known(bus, scope, selectors)
     refuse_parts(cells, "restart")
+    if dependents := find_dependents(bus, cells):  # systemd restarts them in any case
+        tell(f"doractl: {format_dependents(cells, dependents)}", err=True)
+        cells += dependents
     with uninhibited(scope, cells, "restart", how, TellWaiting()), StageLine(sys.stderr) as stage:
         observer = partial(tell_stage, stage)
         outcomes = restart_cells(bus, scope, cells, "doractl restart", force, observer)
@@ -44,4 +48,8 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
             from dora_systemd.verbs.start.launch import restart_asked
 
             outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]
+    if any(one.problem for one in outcomes):
+        from dora_systemd.cli.last_words import with_last_words
+
+        return print_outcomes(with_last_words(bus, scope, one) for one in outcomes)
     return print_outcomes(outcomes)

@@ -17,7 +17,6 @@ from dora_systemd.cli.parameters import (
     name_option,
     print_outcomes,
     print_warnings,
-    tell,
     wants_json,
 )
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
@@ -184,12 +183,7 @@ def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
     try:
         yield
     except DoraSystemdError as error:
-        if error.code is not ExitCode.FAILURE:
-            raise
-        from dora_systemd.decisions.why.signs import known_remedy
-        from dora_systemd.verbs.why import words_of_start
+        from dora_systemd.cli.last_words import print_last_words
 
-        words = words_of_start(bus, scope, uuid)
-        for line in words:
-            tell(f"  {line}", err=True)
-        raise DoraSystemdError(error.message, known_remedy(words) or error.hint) from error
+        hint = print_last_words(bus, scope, uuid, error)
+        raise DoraSystemdError(error.message, hint, error.code) from error

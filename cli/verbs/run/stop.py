@@ -26,6 +26,7 @@ from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.parts import refuse_parts, without_parts
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
+from dora_systemd.verbs.needs.dependents import find_dependents, format_dependents
 from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within
 
 
@@ -45,9 +46,9 @@ def command(
     """Stop dataflows and wait until they have ended.
 
     Nodes are told to stop; those still running after the grace duration of the dataflow are
-    killed. Several dataflows stop at the same time. On a terminal it asks before it stops one that
-    doractl inhibit or a node inhibits. Without SELECTOR, a terminal is asked which
-    one; the only one that runs is stopped.
+    killed. Several dataflows stop at the same time. Those that need one of them stop with it. On a
+    terminal it asks before that, and before it stops one that doractl inhibit or a node inhibits.
+    Without SELECTOR, a terminal is asked which one; the only one that runs is stopped.
 
     Examples:
       doractl stop                                the one that runs, or asks
@@ -101,6 +102,16 @@ def _asked(cells: Sequence[Cell]) -> Cell:
     return numbers.get(text) or Selector(text).loaded(cells)
 
 
+def _ask_dependents(cells: Sequence[Cell], dependents: Sequence[Cell]) -> None:
+    """Ask on the terminal before other dataflows stop that need these."""
+    if not dependents:
+        return
+    click.echo(format_dependents(cells, dependents), err=True)
+    names = ", ".join(cell.name for cell in [*cells, *dependents])
+    if not click.confirm(f"Stop {names}?", err=True):
+        raise DoraSystemdError("nothing was stopped", "--force kills all of them at once")
+
+
 def _ask_inhibited(scope: Scope, cells: Sequence[Cell]) -> None:
     """Ask on the terminal before a dataflow stops whose restart is inhibited."""
     for name, holders in read_holders(scope, [cell.name for cell in cells if cell.is_up]).items():
@@ -112,9 +123,15 @@ def _ask_inhibited(scope: Scope, cells: Sequence[Cell]) -> None:
 
 def _stop(bus: Bus, scope: Scope, cells: list[Cell], most: int) -> int:
     refuse_parts(cells, "stop")
+    dependents = find_dependents(bus, cells)
     if most > 0 and sys.stdin.isatty():
-        _ask_inhibited(scope, cells)
+        _ask_dependents(cells, dependents)
+        _ask_inhibited(scope, [*cells, *dependents])
+    elif dependents:
+        tell(f"doractl: {format_dependents(cells, dependents)}", err=True)
     note_stop(cells)
+    note_stop(dependents, f"doractl stop {' '.join(cell.name for cell in cells)}")
+    cells = [*cells, *dependents]
     if most != INFINITY:
         return print_outcomes(stop_cells_within(bus, scope, cells, most))
     with StageLine(sys.stderr) as stage:

@@ -14,6 +14,7 @@ events came before: dora's events and the ends of its processes arrive in any or
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.asked import is_stopped
+from dora_systemd.decisions.cell.exits import parse_exit
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
@@ -228,9 +229,13 @@ def result(cell: Cell, event: life.ResultKnown) -> Next:
     }
     spent = table.spent(cell.nodes)
     if failed or spent:
-        reason = ", ".join(f"node {node}: {how}" for node, how in {**failed, **spent}.items())
+        # First those that have failed by themselves; dora reports the nodes in any order.
+        ends = dict(
+            sorted({**failed, **spent}.items(), key=lambda one: bool(parse_exit(one[1]).by))
+        )
+        reason = ", ".join(f"node {node}: {how}" for node, how in ends.items())
         code = RunnerExit.NODES_FAILED if spent else RunnerExit.FAILED
-        cell = because(cell, Cause.NODE_FAILED, {**failed, **spent})
+        cell = because(cell, Cause.NODE_FAILED, ends)
         cell = replace(cell, failure=reason, exit=code)
     elif not (cell.ready_us or _is_stopping(cell)):
         # All nodes have ended before dora's start barrier was reported, but it was open.

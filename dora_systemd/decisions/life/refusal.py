@@ -38,6 +38,11 @@ def format_refusal(error: DoraSystemdError) -> str:
     return f"{FAILED_BECAUSE}{short_line(error.message, _LONGEST)}{hint}"
 
 
+def without_hint(text: str) -> str:
+    """STATUS= of a runner, without the hint of a refusal."""
+    return text.partition(_HINT)[0]
+
+
 def parse_refusal(text: str, status: int) -> DoraSystemdError | None:
     """The error that a runner has ended with, None for any other end.
 

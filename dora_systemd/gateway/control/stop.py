@@ -20,6 +20,7 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import uninhibited
+from dora_systemd.verbs.needs.dependents import find_dependents
 from dora_systemd.verbs.restart import require_startable, restart_cells
 from dora_systemd.verbs.stop import note_stop, stop_cells
 
@@ -37,7 +38,7 @@ async def stop(talk: Talk, request: Request) -> dict[str, Any]:
             ExitCode.NOT_RUNNING,
         )
     await asyncio.to_thread(refuse_parts, [cell], "stop")
-    await asyncio.to_thread(note_stop, [cell], "dora stop")
+    await asyncio.to_thread(_note_stop, scope, cell)
     outcome = await _within(scope, cell, request, lambda: stop_cells(Bus(scope), scope, [cell])[0])
     if outcome.problem:
         raise DoraSystemdError(outcome.problem)
@@ -59,6 +60,12 @@ async def restart(talk: Talk, request: Request) -> dict[str, Any]:
         hint = outcome.hint or f"doractl {scope.flag} why {cell.name} tells more"
         raise DoraSystemdError(outcome.problem, hint)
     return {"DataflowRestarted": {"old_uuid": cell.uuid, "new_uuid": cell.uuid}}
+
+
+def _note_stop(scope: Scope, cell: Cell) -> None:
+    """Note who stops a dataflow and, with it, those that need it."""
+    note_stop([cell], "dora stop")
+    note_stop(find_dependents(Bus(scope), [cell]), f"dora stop {cell.name}")
 
 
 def _restart(scope: Scope, cell: Cell) -> Outcome:

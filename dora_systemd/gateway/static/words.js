@@ -53,7 +53,7 @@ export const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"
 const TONES = {
   running: "good", ready: "good", dynamic: "good", finished: "calm", stopped: "calm",
   starting: "busy", stopping: "busy", restarting: "warn", reloading: "busy", degraded: "warn",
-  waiting: "warn", failed: "bad", silent: "warn",
+  waiting: "warn", frozen: "warn", failed: "bad", silent: "warn",
   current: "good", trial: "busy", proved: "calm", unproved: "warn",
   "rolled-back": "warn",
 };

@@ -1,14 +1,16 @@
 """Explains why a unit did not start or has failed, from its properties."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.life.causes import result_words
-from dora_systemd.decisions.life.refusal import parse_refusal
+from dora_systemd.decisions.life.refusal import parse_refusal, without_hint
 from dora_systemd.decisions.life.setup_exits import setup_failure
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import name_from_unit
 
 _PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
 _CLD_EXITED = 1
@@ -22,6 +24,19 @@ def job_reason(manager: Manager, unit: str, result: str) -> str:
     if result == "dependency":
         return "a unit that it needs failed"
     return failure_reason(manager, unit)
+
+
+def need_failure(manager: Manager, flag: str, needed: Iterable[str]) -> tuple[str, str]:
+    """Which of the needed units has failed, and where more is found.
+
+    flag: of the scope.
+    """
+    for unit in needed:
+        if manager.read(unit, ["ActiveState"])["ActiveState"] != "active":
+            if name := name_from_unit(unit):
+                return f"dataflow {name}, which it needs, failed", f"doractl {flag} why {name}"
+            return f"{unit}, which it needs, failed", f"systemctl {flag} status {unit}"
+    return "a unit that it needs failed", f"systemctl {flag} --failed"
 
 
 def runners_refusal(manager: Manager, unit: str) -> DoraSystemdError | None:
@@ -40,11 +55,11 @@ def failure_reason(manager: Manager, unit: str) -> str:
     """One line about the end of `unit`: the runner's last STATUS=, else systemd's result."""
     facts = manager.read(unit, _PROPERTIES)
     special = result_words(facts["Result"])
-    last_words = str(facts["StatusText"]).removeprefix(FAILED_BECAUSE)
+    last_words = without_hint(str(facts["StatusText"])).removeprefix(FAILED_BECAUSE)
     if not last_words:
         return special or _exit_words(facts)
     # The runner's own message says more than its exit status.
-    is_verdict = last_words != facts["StatusText"]
+    is_verdict = str(facts["StatusText"]).startswith(FAILED_BECAUSE)
     cause = special or ("" if is_verdict else _exit_words(facts))
     return f"{last_words} ({cause})" if cause else last_words
 

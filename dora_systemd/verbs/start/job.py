@@ -27,7 +27,7 @@ from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.reason import job_reason, runners_refusal
+from dora_systemd.verbs.facts.reason import job_reason, need_failure, runners_refusal
 from dora_systemd.verbs.start.unit import systemd_number
 
 _POLL_SECONDS = 0.2
@@ -59,6 +59,7 @@ def start_unit(
     the unit stays as failed. If the runner refuses the dataflow, no unit is left.
     """
     unit = unit_name(options.name)
+    needed = _needed(manager, unit, properties)
     try:
         observe = partial(_tell, manager, unit, on_stage)
         result = _begin(manager, unit, properties, observe, wait, beside)
@@ -76,10 +77,20 @@ def start_unit(
                 manager.run_jobs("StopUnit", [link for link, _ in beside])
             manager.reset_failed(unit)
         raise refusal
+    if result == "dependency":
+        reason, more = need_failure(manager, scope.flag, needed)
+        raise DoraSystemdError(f"cannot start {options.name}: {reason}", f"{more} tells more")
     if has_failed and wait:
         result = "failed" if result == JOB_DONE else result
         raise _start_failure(manager, scope, unit, options.name, result)
     return Started(options.uuid, options.name, unit, is_ready=wait)
+
+
+def _needed(manager: Manager, unit: str, properties: Sequence[Property] | None) -> list[str]:
+    """The units that this one requires; systemd forgets a transient unit that it cannot start."""
+    if properties is None:
+        return list(manager.read(unit, ["Requires"])["Requires"] or ())
+    return [one for name, _, value in properties if name == "Requires" for one in value]
 
 
 def _tell(

@@ -46,9 +46,25 @@ def test_a_dataflow_stops_with_the_one_that_it_needs(
     run("systemctl", base.scope.flag, "restart", base.unit)
     wait_for("it restarts too", lambda: cell.show("MainPID") not in (pid, "0"))
     wait_for("it is up", lambda: cell.show("ActiveState") == "active")
-    base.doractl("stop", base.name)
-    wait_for("it stops too", lambda: cell.is_gone)
+    done = base.doractl("stop", base.name)
+    assert f"{cell.name} needs {base.name} and ends with it" in done.stderr
+    assert done.stdout.count("Dataflow stopped: ") == 2
+    assert cell.is_gone
     assert cell.show("Result") == "success"
+    assert f"(doractl stop {base.name})" in cell.doractl("why", cell.name).stdout
+
+
+@pytest.mark.warns("Dependency failed for")
+def test_a_unit_that_is_needed_and_fails_is_named(cell: Cell, project: Project) -> None:
+    flag, unit = cell.scope.flag, f"{cell.name[:50]}-false.service"
+    words = [f"--unit={unit}", "--property=Type=oneshot", "--remain-after-exit", "false"]
+    run("systemd-run", flag, *words, check=False)
+    try:
+        done = cell.start(one_node(project), "--needs", f"unit:{unit}", check=False)
+    finally:
+        run("systemctl", flag, "reset-failed", unit, check=False)
+    assert f"cannot start {cell.name}: {unit}, which it needs, failed" in done.stderr
+    assert f"hint: systemctl {flag} status {unit} tells more" in done.stderr
 
 
 def test_a_dataflow_stops_with_a_unit_whose_name_is_escaped(cell: Cell, project: Project) -> None:

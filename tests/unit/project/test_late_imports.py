@@ -36,15 +36,14 @@ LATE = {
     },
     "a start that succeeds has no last words, most follow no log and copy no files": {
         "cli.verbs.run.start": {
-            *("cli.foreground", "verbs.start.run", "verbs.why", "decisions.why.signs"),
-            "verbs.machines.push",
+            *("cli.foreground", "cli.last_words", "verbs.start.run", "verbs.machines.push"),
         },
     },
     "it reads projects: most verbs for other hosts do not": {
         "cli.remote.dispatch": {"cli.remote.rollout"},
     },
     "a restart of what runs makes no plan": {
-        "cli.verbs.run.restart": {"verbs.start.launch"},
+        "cli.verbs.run.restart": {"cli.last_words", "verbs.start.launch"},
     },
     "only a wrong command line needs a similar command, or the names of dataflows": {
         "cli.group": {"difflib", "adapters.bus.systemd", "verbs.facts.cells"},

@@ -1,7 +1,13 @@
 """What people are told about needs that may never be met."""
 
+import pytest
+
 from dora_systemd.decisions.cell.needs import NodeNeed
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.reason import need_failure
+from dora_systemd.verbs.needs.dependents import find_dependents, format_dependents
 from dora_systemd.verbs.needs.notes import needs_warnings
+from tests.unit.fakes.manager import FakeManager, options
 
 NEEDS = (NodeNeed("arm", "/dev/odd"), NodeNeed("arm", "/dev/video0"))
 
@@ -24,3 +30,40 @@ def test_without_a_sandbox_nothing_is_closed() -> None:
 def test_the_sandbox_has_its_own_tmp() -> None:
     (told,) = needs_warnings((), (NodeNeed("arm", "/tmp/map"),), True, ())
     assert told == "node arm waits for /tmp/map, but the sandbox has its own /tmp"
+
+
+def test_what_needs_a_dataflow_ends_with_it() -> None:
+    """Also what needs it because of another one; what does not run is none of them."""
+    manager = FakeManager()
+    for name in ("base", "arm", "hand", "old", "other"):
+        manager.add(options(name), active="failed" if name == "old" else "active")
+    manager.units["dora-base.service"]["RequiredBy"] = ["dora-arm.service", "dora-old.service"]
+    manager.units["dora-arm.service"]["RequiredBy"] = ["dora-hand.service", "foreign.service"]
+    base = [one for one in read_cells(manager) if one.name == "base"]
+    found = find_dependents(manager, base)
+    assert [one.name for one in found] == ["arm", "hand"]
+    assert format_dependents(base, found) == "arm, hand need base and end with it"
+    assert format_dependents(base, found[:1]) == "arm needs base and ends with it"
+    assert find_dependents(manager, found[1:]) == []
+    assert format_dependents(base, []) == ""
+
+
+@pytest.mark.parametrize(
+    ("needed", "reason", "more"),
+    [
+        (["dora-base.service"], "dataflow base, which", "doractl --system why base"),
+        (
+            ["sshd.service"],
+            "sshd.service, which it needs",
+            "systemctl --system status sshd.service",
+        ),
+        (["dora-up.service"], "a unit that it needs failed", "systemctl --system --failed"),
+    ],
+)
+def test_a_need_that_failed_is_named(needed: list[str], reason: str, more: str) -> None:
+    manager = FakeManager()
+    manager.add(options("base"), active="failed")
+    manager.add(options("up"))
+    found = need_failure(manager, "--system", ["dora-up.service", *needed])
+    assert found[0].startswith(reason)
+    assert found[1] == more

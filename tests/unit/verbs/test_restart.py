@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.reason import failure_reason
 from dora_systemd.verbs.restart import Ask, require_startable, restart_cells
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
@@ -47,7 +49,30 @@ def test_restart_that_fails(manager: FakeManager) -> None:
     manager.units[UNIT] |= {"StatusText": "node camera failed", "ExecMainStatus": 1}
     manager.job_results[UNIT] = "failed"
     (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
-    assert outcome.problem == f"cannot restart {UNIT}: node camera failed (exit code 1)"
+    assert outcome.problem == "cannot restart robot: node camera failed (exit code 1)"
+    assert outcome.hint == "doractl --user why robot tells more"
+
+
+def test_restart_that_the_runner_refuses(manager: FakeManager) -> None:
+    """As a start: the hint is no part of the sentence."""
+    said = format_refusal(REFUSAL)
+    status = int(refusal_exit(REFUSAL))
+    manager.units[UNIT] |= {"StatusText": said, "ExecMainStatus": status}
+    manager.job_results[UNIT] = "failed"
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
+    assert outcome.error
+    assert (outcome.problem, outcome.hint) == (REFUSAL.message, REFUSAL.hint)
+    assert failure_reason(manager, UNIT) == f"{REFUSAL.message}"
+
+
+def test_restart_without_what_it_needs(manager: FakeManager) -> None:
+    manager.add(options("base"), active="failed")
+    manager.units[UNIT]["Requires"] = ["dora-base.service"]
+    manager.job_results[UNIT] = "dependency"
+    robot = [one for one in read_cells(manager) if one.name == "robot"]
+    (outcome,) = restart_cells(manager, SCOPE, robot, BY, ask=accept)
+    assert outcome.problem == "cannot restart robot: dataflow base, which it needs, failed"
+    assert outcome.hint == "doractl --user why base tells more"
 
 
 def test_what_could_not_start_again_keeps_running(manager: FakeManager) -> None:

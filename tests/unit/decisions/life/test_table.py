@@ -296,6 +296,14 @@ def test_the_barrier_opens_although_a_node_has_failed() -> None:
     assert Record("dataflow-started") in actions
 
 
+def test_what_failed_by_itself_is_named_first() -> None:
+    """dora reports the nodes in any order."""
+    ends = {"a": exit_of(1)._replace(by="b"), "b": exit_of(1)}
+    now, _ = live(*READY, life.RunFinished(10), life.ResultKnown(11, ends))
+    assert now.failure == "node b: exit code 1, node a: exit code 1 because node b failed"
+    assert [*now.culprits] == ["b", "a"]
+
+
 def test_an_empty_result_is_unknown_and_not_success() -> None:
     now, _ = live(*READY, life.RunFinished(10), life.ResultKnown(11))
     assert now.exit is RunnerExit.ENGINE_LOST
