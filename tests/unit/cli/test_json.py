@@ -95,8 +95,8 @@ def test_an_outcome_with_a_problem(manager: FakeManager, capsys: Printed) -> Non
     (outcome,) = objects(capsys, "restart", "robot", status=ExitCode.FAILURE)
     assert (outcome["action"], outcome["result"], outcome["text"]) == ("restart", "failed", None)
     assert outcome["error"] == {
-        "message": f"cannot restart {UNIT}: it was stopped while it started",
-        "hint": None,
+        "message": "cannot restart robot: it was stopped while it started",
+        "hint": "doractl --system why robot tells more",
         "exit_status": 1,
     }
 
