@@ -16,6 +16,14 @@ _SECTION_OF = {setting.name: title for title, table in SECTIONS.items() for sett
 class SettingsCommand(click.Command):
     """A verb whose --help shows its own options first, then those of settings by concern."""
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the command line; `--flag=false` is `--no-flag`, as dora writes it."""
+        known: dict[str, str] = {}
+        for parameter in self.get_params(ctx):
+            for on, off in zip(parameter.opts, parameter.secondary_opts, strict=False):
+                known |= {f"{on}=true": on, f"{on}=false": off}
+        return super().parse_args(ctx, [known.get(word, word) for word in args])
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of options."""
         sections: dict[str, list[tuple[str, str]]] = {title: [] for title in ("Options", *SECTIONS)}

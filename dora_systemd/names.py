@@ -19,8 +19,9 @@ SLICE = "dora.slice"
 RESERVED_NAMES = frozenset({"gateway"})
 """dora-gateway.service is the gateway."""
 
-MAX_NAME = 200
-"""Maximum characters of a name: unit names have at most 255 (systemd.unit(5))."""
+MAX_NAME = 186
+"""Maximum characters of a name: systemd makes a directory with the name of the unit, and 69 more
+characters, for PrivateTmp=, and file names have at most 255."""
 
 _LASTS = "".join(f"\\U{plane:04x}fffe\\U{plane:04x}ffff" for plane in range(17))
 _UNREADABLE = re.compile(f"[\\x00\\ud800-\\udfff\\ufdd0-\\ufdef{_LASTS}]")

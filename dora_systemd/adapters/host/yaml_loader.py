@@ -41,6 +41,11 @@ class Loader(_BASE):  # type: ignore[misc]
         document = super().get_single_node()
         for node in _items(_values(document).get("nodes")):
             values = _values(node)
+            if (
+                isinstance(ident := values.get("id"), yaml.ScalarNode)
+                and ident.value.lower() == "null"
+            ):
+                ident.tag = f"{_TAG}str"  # the only text that a node must have: not null for dora
             outputs = _items(values.get("outputs"))
             for text in (*(values[key] for key in _TEXT_KEYS & values.keys()), *outputs):
                 if isinstance(text, yaml.ScalarNode) and text.tag != f"{_TAG}null":

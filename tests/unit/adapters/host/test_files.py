@@ -58,6 +58,15 @@ def test_yaml_as_dora_reads_it(yaml: Any, text: str, value: object) -> None:
     assert yaml(text) == value
 
 
+@pytest.mark.parametrize(
+    ("text", "value"), [("null", "null"), ("Null", "Null"), ("~", None), ("", None), ("5", "5")]
+)
+def test_an_id_as_dora_reads_it(yaml: Any, text: str, value: str | None) -> None:
+    """A node must have an id, so the word null is one; a node need not have a build."""
+    (node,) = yaml(f"nodes: [{{id: {text}, build: null}}]")["nodes"]
+    assert node == {"id": value, "build": None}
+
+
 def test_texts_of_nodes_stay_as_written(yaml: Any) -> None:
     node = "{id: 1.10, path: true, args: 1.50, outputs: [007, x], env: {A: 1.50}, build: ~}"
     assert yaml(f"nodes: [{node}]\nargs: 1.50") == {
