@@ -6,24 +6,35 @@ stream for all output cannot be forgotten in any of them.
 
 import io
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, TextIO
 
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import REACHED_AS
 from dora_systemd.terminal_text import escaped
 
 _STANDARD = ("stdin", "stdout", "stderr")
 """By the number of their descriptors."""
+VERBS = (
+    *("deploy", "destroy", "disable", "doctor", "dora", "enable", "env", "export", "inhibit"),
+    *("list", "logs", "machine", "member", "node", "releases", "reload", "reset", "restart"),
+    *("rollback", "run", "set", "setup", "show", "start", "stop", "top", "up", "version", "why"),
+)
+"""As in group.py, which takes longer to import than most commands."""
 
 
 class Edge(io.TextIOWrapper):
     """A stream that writes text as terminal_text.escaped() shows it."""
 
+    reached_as = ""
+    """The -H of the person who reads this on another host, see with_host()."""
+
     def write(self, text: str) -> int:
         """Write `text` with control characters escaped."""
-        return super().write(escaped(text))
+        return super().write(escaped(with_host(text, self.reached_as)))
 
     def write_own(self, text: str) -> None:
         """Write `text` unchanged."""
@@ -56,7 +67,17 @@ class Messages(Edge):
 def put_in_place() -> None:
     """Replace standard output and error by escaping streams; open those that are closed."""
     _open_closed()
+    # Not for the programs that doractl starts.
+    Edge.reached_as = os.environ.pop(REACHED_AS, "")
     sys.stdout, sys.stderr = _edge(sys.stdout, Edge), _edge(sys.stderr, Messages)
+
+
+def with_host(text: str, host: str) -> str:
+    """The text, in which commands of doractl are for that host; unchanged without one."""
+    if not host or "doractl " not in text:
+        return text
+    command = rf"\bdoractl (?=(?:--(?:system|user) )?(?:{'|'.join(VERBS)})\b)"
+    return re.sub(command, f"doractl -H {host} ", text)
 
 
 def _open_closed() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from dora_systemd.cli.colors import wants_colors
 from dora_systemd.cli.edge import write_own
 from dora_systemd.cli.remote.plan import Plan
+from dora_systemd.decisions.logs.query import journal_timestamp
 from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.decisions.remote.failures import too_much
 from dora_systemd.decisions.remote.hosts import Host
@@ -52,6 +53,7 @@ class LogPrinter:
         has_colors = wants_colors(sys.stdout)
         self._terminal = TerminalLines(want_dataflow=not is_one, want_colors=has_colors)
         self._is_complete = False
+        self._last = dict.fromkeys(hosts, 0)
 
     def said(self, host: Host, data: bytes) -> DoraSystemdError | None:
         """Take records."""
@@ -59,11 +61,25 @@ class LogPrinter:
         if self._form == "json":
             for value in records.objects(data):
                 line = json.dumps(with_host(value, host.text, self._key)).encode() + b"\n"
-                self.merge.add(host.text, time_of(value.get(TIME)), line, now)
+                self._add(host, time_of(value.get(TIME)), line, now)
             return None
         for record in records.exported(data):
-            self.merge.add(host.text, int(record[TIME]), self._line(host, record), now)
+            self._add(host, int(record[TIME]), self._line(host, record), now)
         return too_much(host) if records.is_too_much else None
+
+    def _add(self, host: Host, at_us: int, line: bytes, now: float) -> None:
+        self._last[host] = max(self._last[host], at_us)
+        self.merge.add(host.text, at_us, line, now)
+
+    def again(self, host: Host, words: Sequence[str]) -> list[str]:
+        """What a host is asked for when it is back: the lines after the last one."""
+        self._records[host] = Records()
+        self.merge.begin(host.text)
+        since = self._last[host] + 1
+        # Not only the last ones; without a line yet, as at first.
+        return (
+            [*words, f"--since={journal_timestamp(since)}", "-n", "all"] if since > 1 else [*words]
+        )
 
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
         """No more of this host."""

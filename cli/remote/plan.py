@@ -8,7 +8,7 @@ import click
 from dora_systemd.decisions.remote.command import Way
 from dora_systemd.decisions.remote.words import without_flag
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.remote.talk import ANSWER_SECONDS
+from dora_systemd.verbs.remote.talk import ANSWER_SECONDS, SHORT_SECONDS
 
 _REFUSED = {
     "env": "its variables lead to 127.0.0.1 there; use doractl -H HOST dora NAME -- ARGUMENT...",
@@ -64,7 +64,19 @@ class Plan(NamedTuple):
     @property
     def most_seconds(self) -> float | None:
         """The bound of its answer: what only looks is quick."""
-        return None if self.has_lines or self.verb in ("logs", "dora") else ANSWER_SECONDS
+        if self.has_lines or self.verb in ("logs", "dora"):
+            return None
+        return SHORT_SECONDS if self.verb == "list" else ANSWER_SECONDS
+
+    @property
+    def silence(self) -> float | None:
+        """The longest time without a byte of its answer, if that may be long."""
+        return ANSWER_SECONDS if self.verb == "logs" and not self.is_endless else None
+
+    @property
+    def follows_again(self) -> bool:
+        """Whether it goes on with a host that was lost, when that is back."""
+        return self.verb == "logs" and bool(self.options.get("is_follow"))
 
 
 def plan_of(context: click.Context, words: list[str]) -> Plan:

@@ -29,21 +29,44 @@ def run_on_all(hosts: Sequence[Host], plan: Plan, opening: bytes | None = None) 
     logs = printer if isinstance(printer, LogPrinter) else None
     is_full = logs.merge.is_full if logs else lambda _host: False
     way = plan.way if opening is None else Way.FED
-    talks = Talks(hosts, way, words, plan.most_seconds, is_full, opening=opening)
+    most, silence = plan.most_seconds, plan.silence
+    talks = Talks(hosts, way, words, most, is_full, opening=opening, silence=silence)
     complaints = Complaints(plan.wants_json)
     statuses: list[int] = []
+    again = _Again(talks, logs, words) if logs and plan.follows_again else None
     with Interrupts(talks, plan) as interrupt:
         for event in talks.events():
             if isinstance(event, Said):
                 _take(talks, printer, complaints, event)
             elif isinstance(event, Ended):
-                statuses.append(_end(printer, complaints, event))
+                if not (again and again.is_known(event)):
+                    statuses.append(_end(printer, complaints, event))
+                if again:
+                    again.ended(event)
             elif logs:
                 logs.look(talks.is_complete)
     printer.finish()
     if interrupt.was_interrupted:
         return ExitCode.INTERRUPTED
     return _worst(statuses, has_grep=bool(logs and plan.options.get("grep")))
+
+
+class _Again:
+    """Follows hosts again that are lost after their login: that is said once."""
+
+    def __init__(self, talks: Talks, logs: LogPrinter, words: Sequence[str]) -> None:
+        self._talks, self._logs, self._words = talks, logs, words
+        self._lost: set[Host] = set()
+
+    def is_known(self, ended: Ended) -> bool:
+        """Whether the host is away for longer: then its end is no news."""
+        return ended.error is not None and ended.host in self._lost and not ended.was_in
+
+    def ended(self, ended: Ended) -> None:
+        """Talk with the host again, unless its doractl has ended by itself."""
+        if ended.error and (ended.was_in or ended.host in self._lost):
+            self._lost.add(ended.host)
+            self._talks.begin_again(ended.host, self._logs.again(ended.host, self._words))
 
 
 def _printer(hosts: Sequence[Host], plan: Plan) -> tuple[list[str], Printer]:

@@ -37,7 +37,7 @@ def is_terminal() -> bool:
 
 def run_there(host: Host, plan: Plan) -> int:
     """Run the verb on the terminal there; its exit status. Raises DoraSystemdError (NO_HOST)."""
-    command = remote_command(Way.TERMINAL, plan.words)
+    command = remote_command(Way.TERMINAL, plan.words, host=host)
     status, said = run_on_terminal(ssh_arguments(host, Way.TERMINAL, command))
     if status == SSH_FAILED and said:
         raise lost(host, said) if is_of_ssh(said.encode()) else unreached(host, said)
@@ -52,7 +52,7 @@ def pass_through(host: Host, plan: Plan) -> int:
 
     Raises DoraSystemdError (NO_HOST).
     """
-    talks = Talks([host], plan.way, plan.words, plan.most_seconds)
+    talks = Talks([host], plan.way, plan.words, plan.most_seconds, silence=plan.silence)
     status: int = ExitCode.OK
     # A character may be in two pieces.
     decoders = {one: getincrementaldecoder("utf-8")("backslashreplace") for one in (False, True)}

@@ -41,7 +41,10 @@ class TablePrinter(Whole, Generic[Row]):
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
         """Read its rows."""
         text = self.take(host).strip()
-        if error or not text:
+        if error:
+            return None
+        if not text:  # its doractl has said why on standard error
+            self._found[host.text] = []
             return None
         found = objects_of(text, host.text)
         known = [row for row in map(self._parse, found or ()) if row is not None]

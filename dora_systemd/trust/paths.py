@@ -54,6 +54,16 @@ class Place(NamedTuple):
         return self.owners == {0} and not self.shared and not others_write
 
     @property
+    def changeable(self) -> str:
+        """How others than root can have changed it, or "" if none can. A group counts as others."""
+        if self.uid != 0:
+            return "the file is not root's"
+        if self.borrowed:
+            return self.borrowed
+        is_shared = self.mode & (stat.S_IWOTH | stat.S_IWGRP)
+        return "others than root can write to the file" if is_shared else ""
+
+    @property
     def is_open(self) -> bool:
         """Whether it is a directory in which every user can create files, such as /tmp."""
         return stat.S_ISDIR(self.mode) and bool(self.mode & stat.S_IWOTH)

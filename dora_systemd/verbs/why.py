@@ -140,6 +140,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         {key: node.silent for key, node in nodes if node.silent},
         is_gathering=status.stage == GATHERING,
         stopped={key: node.asked_by for key, node in nodes if is_stopped(node)},
+        policy=cell.options.restart.policy,
     )
 
 

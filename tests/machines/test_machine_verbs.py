@@ -51,16 +51,21 @@ def test_a_key_for_dataflows_only(gpu: None) -> None:
 
 
 def test_no_other_key_takes_its_place(gpu: None) -> None:
-    """root of a may log in as root of b: a link that has lost its key must not."""
+    """root of a may log in as root of b: a link whose key is not let in must not."""
     del gpu
+    config = Path("/root/.ssh/config")
+    before = config.read_text() if config.exists() else ""
+    config.write_text(f"{before}Host b\n  IdentityFile /root/.ssh/id_ed25519\n")
     lines, kept = "/root/.ssh/authorized_keys", "/root/authorized_keys"
-    there("b", f"'cp {lines} {kept}; sed -i /dora-systemd:gpu/d {lines}'")
+    there("b", f"cp {lines} {kept} && sed -i /dora-systemd:gpu/d {lines}")
     try:
-        with flow_on(Flow({"gpu": "b"})) as flow:
+        expected = ("flow: Dataflow flow failed: ", "dora-flow.service")
+        with flow_on(Flow({"gpu": "b"}), expected) as flow:
             refused = flow.cell.start(Path(PLACE) / "dataflow.yml", check=False)
             checked = run("doractl", "machine", "check", "gpu", check=False)
     finally:
         there("b", "mv", kept, lines)
+        config.write_text(before)
     assert refused.returncode != 0
     for said in (refused.stderr, checked.stdout):
         assert "the key of the machine is not let in" in said

@@ -34,6 +34,7 @@ def refused(flow: Flow, *words: str) -> None:
     flow.refused(*words, code=ExitCode.BAD_INPUT, flags=("--push",))
 
 
+@pytest.mark.warns("Files of machine gpu of dataflow flow differ: machine gpu runs another")
 def test_the_files_come_first(flow: Flow) -> None:
     place = Project(Path(PLACE), is_new=False)
     place.write("dataflow.systemd.yml", "max_restarts: 1\n")
@@ -49,6 +50,12 @@ def test_the_files_come_first(flow: Flow) -> None:
     place.write("more/data.txt", "2\n")
     flow.start("--push")
     assert there("b", "cat", f"{PLACE}/more/data.txt").stdout == "2\n"
+    assert "another" not in flow.status()
+    doubler = Path(PLACE) / "doubler.py"
+    doubler.write_text(f"{doubler.read_text()}# changed\n")
+    flow.cell.doractl("restart", NAME)
+    differs = "3/3 nodes running; machine gpu runs another doubler.py than the one here"
+    wait_for("it is said that b has the old file", lambda: flow.status() == differs)
 
 
 def test_root_copies_nothing_of_others(flow: Flow) -> None:

@@ -106,6 +106,11 @@ EVENTS = {
         NOTICE,
         "Machine {machine} of dataflow {dataflow} is back",
     ),
+    "machine-differs": EventKind(
+        "369099ed589847a999a2ba58e394ab40",
+        WARNING,
+        "Files of machine {machine} of dataflow {dataflow} differ",
+    ),
     "reloaded": _dataflow("6ddc74129bfd4d61bd13747edb506634", NOTICE, "was reloaded"),
     "files-changed": EventKind("902dc080ec514a37b5dfa7ecceb95347", INFO, "File changed: {files}"),
     "node-reloaded": EventKind("4c9f8decbcc94dfbb46948d6c865191d", NOTICE, "Node {node} was {how}"),

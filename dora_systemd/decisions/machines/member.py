@@ -5,7 +5,7 @@ goes to all, as far as nodes see it: variables, the sandbox, the grace duration.
 properties of the unit are those of the head; an entry of `machines:` has those of its machine.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from dora_systemd.decisions.cell.line_rates import ALL_NODES, RateLimits
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.machines.entry import Machine
 from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.resolve import Settings
@@ -60,10 +61,19 @@ def on_head(options: RunnerOptions) -> RunnerOptions:
     return options._replace(
         head="",
         node_limits=tuple(one for one in options.node_limits if one.node not in away),
-        node_rights=tuple(one for one in options.node_rights if one.node not in away),
+        node_rights=tuple(_on_head(options.node_rights, away)),
         log_rates={key: one for key, one in options.log_rates.items() if key not in away},
         watchdogs=_without(options.watchdogs, away),
     )
+
+
+def _on_head(rights: Iterable[NodeRights], away: set[str]) -> Iterator[NodeRights]:
+    """The head decides which failure ends the dataflow; the rest is for the machine of the node."""
+    for one in rights:
+        if one.node not in away:
+            yield one
+        elif one.essential:
+            yield NodeRights(one.node, essential=True)
 
 
 def _without(watchdogs: Watchdogs, away: set[str]) -> Watchdogs:

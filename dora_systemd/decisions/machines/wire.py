@@ -115,6 +115,22 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Programs:
+    """Member to head: the digests of what its nodes run, see decisions/machines/programs.py."""
+
+    digests: str
+
+
+@dataclass(frozen=True)
+class Hung:
+    """Member to head: a node there is about to be ended. record: the life event, see NodeHung."""
+
+    node: str
+    reason: str
+    record: str
+
+
+@dataclass(frozen=True)
 class Refused:
     """Member to head: it runs nothing, and a restart does not help."""
 
@@ -170,6 +186,8 @@ Message = (
     | Beat
     | Ready
     | Table
+    | Programs
+    | Hung
     | Refused
     | Ended
     | StopPart
@@ -187,6 +205,8 @@ _TYPES: Mapping[str, type[Any]] = {
     "beat": Beat,
     "ready": Ready,
     "table": Table,
+    "programs": Programs,
+    "hung": Hung,
     "refused": Refused,
     "ended": Ended,
     "stop": StopPart,
@@ -195,7 +215,7 @@ _TYPES: Mapping[str, type[Any]] = {
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 _NUMBERS = {"coordinator", "zenoh", "grace", "again", "version", "tries", "failed"}
-_LONG = {"status"}
+_LONG = {"status", "digests"}
 _BY_MACHINE = {(Forwards, "zenoh")}
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from enum import Enum
 
 from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.names import REACHED_AS
 
 CONNECT_SECONDS = 5
 """For the connection, until ssh knows that a server speaks there."""
@@ -64,10 +65,14 @@ def quote(word: str) -> str:
     return f"'{inner}'"
 
 
-def remote_command(way: Way, words: Sequence[str], mark: str = "") -> str:
-    """What the login shell of the host runs. mark: printed first, if not TERMINAL."""
+def remote_command(way: Way, words: Sequence[str], mark: str = "", host: Host | None = None) -> str:
+    """What the login shell of the host runs. mark: printed first, if not TERMINAL.
+
+    host: as which a person has named it, for whom hints are then.
+    """
     first = [] if way is Way.TERMINAL else [mark]
-    script = _one_line(way.value)
+    named = f"export {REACHED_AS}={quote(host.text)}\n" if host and host.destination else ""
+    script = _one_line(f"{named}{way.value}")
     return " ".join(["exec", "sh", "-c", *map(quote, (script, "doractl", *first, *words))])
 
 

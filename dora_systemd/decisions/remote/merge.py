@@ -51,6 +51,10 @@ class Merge:
         """No more will come from that host."""
         self._open.discard(host)
 
+    def begin(self, host: str) -> None:
+        """More will come from that host."""
+        self._open.add(host)
+
     def is_full(self, host: str) -> bool:
         """Whether enough of that host is held."""
         return self._counts[host] >= MOST_HELD or self._bytes[host] >= MOST_BYTES

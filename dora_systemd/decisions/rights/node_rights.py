@@ -165,6 +165,12 @@ def essential_nodes(rights: Iterable[NodeRights]) -> tuple[str, ...]:
     return tuple(one.node for one in rights if one.essential)
 
 
+def without_essential(rights: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
+    """The rights of nodes whose final failure ends nothing here."""
+    kept = (one._replace(essential=None) for one in rights)
+    return tuple(one for one in kept if given_rights(one))
+
+
 def has_process_rights(rights: Iterable[NodeRights]) -> bool:
     """Whether a program has to set something for a node before it runs."""
     return any(given_rights(one).keys() - {"essential", "oom_score_adjust"} for one in rights)

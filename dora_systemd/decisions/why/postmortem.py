@@ -80,6 +80,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         before_us=before.at_us,
         nodes=() if status in UP_WORDS else ended_nodes(life),
         stopped=facts.stopped,
+        policy=facts.policy,
     )
 
 

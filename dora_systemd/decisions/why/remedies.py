@@ -8,7 +8,8 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import FROZEN, WAITING
 from dora_systemd.decisions.why.verdict import Verdict
 
-_AUTOMATIC = "run: doractl restart {name}; --restart-policy on-failure does this automatically"
+_BY_HAND = "run: doractl restart {name}"
+_AUTOMATIC = f"{_BY_HAND}; --restart-policy on-failure does this automatically"
 _OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
 _MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)"
 _REMEDIES = {
@@ -69,4 +70,6 @@ def remedy_of(verdict: Verdict) -> str:
     exit = parse_exit(verdict.details.get("exit", ""))
     if verdict.cause is Cause.NODE_FAILED and exit.kind is ExitKind.SIGNAL:
         return _SIGNAL_REMEDIES.get(exit.number, _REMEDIES[verdict.cause])
-    return _REMEDIES.get(verdict.cause, "")
+    remedy = _REMEDIES.get(verdict.cause, "")
+    has_policy = verdict.policy not in ("", "no")
+    return _BY_HAND if remedy == _AUTOMATIC and has_policy else remedy

@@ -17,7 +17,8 @@ class Facts:
     nodes that wait for a restart. now_boot: id of this boot. restarts: NRestarts= of the unit, None
     if systemd has unloaded it. silent: nodes of which an owed output is missing, and which.
     is_held: whether systemd has not begun the start that it has in its queue. is_gathering: whether
-    it waits for another machine. stopped: nodes that somebody has stopped, and who.
+    it waits for another machine. stopped: nodes that somebody has stopped, and who. policy: its
+    restart policy, "" if that is not known.
     """
 
     status: str = ""
@@ -30,6 +31,7 @@ class Facts:
     is_held: bool = False
     is_gathering: bool = False
     stopped: Mapping[str, str] = field(default_factory=dict)
+    policy: str = ""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Verdict:
     the end. is_given_up: systemd's start limit is reached. is_passing: dora restarts the node.
     starved: nodes downstream. restarts: those that `list` counts, oldest first. before: how the
     life before these ended, and when. nodes: of a dataflow that has ended, as its events name
-    them. stopped: nodes of one that is up which somebody has stopped, and who.
+    them. stopped: nodes of one that is up which somebody has stopped, and who. policy: see Facts.
     """
 
     status: str
@@ -74,6 +76,7 @@ class Verdict:
     before_us: int = 0
     nodes: tuple[NodeRow, ...] = ()
     stopped: Mapping[str, str] = field(default_factory=dict)
+    policy: str = ""
 
     @property
     def is_up(self) -> bool:

@@ -56,7 +56,7 @@ class Pump:
 
     this_life: the same for all runs of a life. Call connect() before the first push().
     end: resolves to the exit status, even if the action EXIT fails. amend: adds to the table what
-    other machines say.
+    other machines say. on_event: is given each event before it changes the cell.
     """
 
     def __init__(
@@ -77,6 +77,7 @@ class Pump:
         self._text = ""
         self._is_ready = False
         self._is_unwritten = False
+        self.on_event: Callable[[life.Event], None] = lambda _: None
         self.amend: Callable[[CellStatus], CellStatus] = lambda table: table
         self._waiting: list[tuple[Callable[[Cell], bool], asyncio.Future[None]]] = []
 
@@ -103,6 +104,8 @@ class Pump:
 
     def _take(self, event: life.Event) -> None:
         before = self.cell
+        with self._guard("tell other machines"):
+            self.on_event(event)
         actions = self._step(event)
         if self.cell is not before:
             with self._guard("show its state"):

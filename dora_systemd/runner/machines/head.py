@@ -31,6 +31,11 @@ from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.awaited import format_missing
 from dora_systemd.decisions.machines.own import is_here
 from dora_systemd.decisions.machines.part import check_placed, with_works
+from dora_systemd.decisions.machines.programs import (
+    differing,
+    format_differing,
+    parse_digests,
+)
 from dora_systemd.decisions.rights.node_rights import is_essential
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
@@ -44,6 +49,7 @@ from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import NOISE, HeadEngine
 from dora_systemd.runner.machines.head_boot import HeadBoot
 from dora_systemd.runner.machines.ports import choose_ports
+from dora_systemd.runner.machines.programs import read_digests
 from dora_systemd.runner.machines.reach import unreached
 from dora_systemd.runner.machines.roster import Roster
 from dora_systemd.runner.machines.shared import Shared
@@ -170,6 +176,27 @@ class HeadDialogue(Dialogue):
         self._ends_at, self._is_ending = 0.0, False
         self._unreached: dict[str, str] = {}
         self._exits: dict[str, life.NodeExited] = {}
+        self._differing: dict[str, list[str]] = {}
+        roster.on_programs = self._compare
+
+    def _compare(self, machine: str, told: str) -> None:
+        self.spawn(f"compare the files of machine {machine}", self._look_at(machine, told))
+
+    async def _look_at(self, machine: str, told: str) -> None:
+        """Say which files of a member are others than here: nothing copies them at a restart."""
+        try:
+            there = parse_digests(told)
+        except (ValueError, RecursionError):
+            return
+        root = Path(self._options.dataflow).parent
+        here = await asyncio.to_thread(read_digests, root, there)
+        self._differing[machine] = found = differing(here, there)
+        if not found:
+            return
+        notice = format_differing(self._differing)
+        details = {"machine": machine, "reason": format_differing({machine: found})}
+        self._pipes.write_event("machine-differs", **details)
+        self._pump.push(life.ReloadNoted(now_us(), notice))
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]

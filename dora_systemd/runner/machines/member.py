@@ -6,6 +6,7 @@ has been told is in memory only.
 """
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -24,6 +25,9 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import check_placed, launch_files
+from dora_systemd.decisions.machines.programs import format_digests
+from dora_systemd.decisions.rights.node_rights import without_essential
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
@@ -34,6 +38,7 @@ from dora_systemd.runner.machines.engine import NOISE, MemberEngine
 from dora_systemd.runner.machines.lines import Lines
 from dora_systemd.runner.machines.member_boot import MemberBoot, no_head
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
+from dora_systemd.runner.machines.programs import own_digests
 from dora_systemd.runner.machines.shared import Shared
 from dora_systemd.runner.machines.uses import Uses
 from dora_systemd.runner.nodes.nodes import Nodes
@@ -54,7 +59,9 @@ class Member(Shared):
     """
 
     def __init__(self, options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> None:
-        super().__init__(options._replace(owes=()), this_life)
+        # The head decides which failure ends the dataflow: its members only report them.
+        rights = without_essential(options.node_rights)
+        super().__init__(options._replace(owes=(), node_rights=rights), this_life)
         if not isinstance(boot, MemberBoot):
             raise no_head()
         self._boot = boot
@@ -62,6 +69,9 @@ class Member(Shared):
         self._dora: MemberEngine | None = None
         self._pump: Pump | None = None
         self._table = self._told = self._version = ""
+        self._prepared: Prepared | None = None
+        self._environment: Mapping[str, str] = {}
+        self._has_head = asyncio.Event()
         self.stops_by_head = False
         self.grace = INFINITY
         self.is_answered = asyncio.Event()
@@ -69,7 +79,7 @@ class Member(Shared):
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Write how each node is started. Raises DoraSystemdError."""
-        self._version = check.version()
+        self._version, self._prepared = check.version(), prepared
         check_placed(self.options, prepared.dataflow)
         paths.launch.mkdir(mode=0o700, exist_ok=True)
         for node, text in launch_files(prepared.dataflow, prepared.plan).items():
@@ -79,7 +89,7 @@ class Member(Shared):
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
         """A daemon for the coordinator of the head."""
-        own = self.options
+        own, self._environment = self.options, environment
         self._dora = MemberEngine(dora, paths, environment, own.addresses, own.machine, boot)
         return self._dora
 
@@ -97,14 +107,31 @@ class Member(Shared):
         assert isinstance(dora, MemberEngine)
         pipes.left_out = NOISE
         self._pump, pump.amend = pump, partial(self._note_table, Uses(nodes))
+        pump.on_event = self._tell_hung
         dialogue = MemberDialogue(options, pump, dora, nodes, pipes)
         dialogue.begin(self, dora)
         dialogue.spawn("hear the head", self._hear_head())
+        dialogue.spawn("tell what its nodes run", self._tell_programs())
         return dialogue
 
     def _note_table(self, uses: Uses, table: CellStatus) -> CellStatus:
         self._table = uses.added(table).to_json()
         return table
+
+    async def _tell_programs(self) -> None:
+        """Say once what the nodes run: their files may be older than those of the head."""
+        if self._prepared is None:
+            return
+        own = self.options, self._prepared, self._environment
+        with contextlib.suppress(DoraSystemdError):  # a program that is gone has its own message
+            digests = await asyncio.to_thread(own_digests, *own)
+            await self._has_head.wait()
+            self.send(wire.Programs(format_digests(digests)))
+
+    def _tell_hung(self, event: life.Event) -> None:
+        """Explain the signal that ends a node, before dora tells the head of its end."""
+        if isinstance(event, life.NodeHung):
+            self.send(wire.Hung(event.node, event.reason, event.record))
 
     def _send_table(self) -> None:
         """With each beat, if something is new."""
@@ -132,6 +159,7 @@ class Member(Shared):
             return
         assert self._dora is not None
         self._dora.set_part(part)
+        self._has_head.set()
         self._push(life.CoordinatorListening(now_us()))
         why = await self._lines.talk(self._hear)
         self._lines = None

@@ -11,7 +11,7 @@ from dora_systemd import __version__
 from dora_systemd.adapters.runner_socket.client import Request
 from dora_systemd.adapters.runner_socket.listener import refuse
 from dora_systemd.adapters.runner_socket.splice import Ends
-from dora_systemd.decisions.cell.machines import members_of
+from dora_systemd.decisions.cell.machines import members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
@@ -31,6 +31,7 @@ _SILENT_BEATS = 3
 """A member of which nothing was heard for so many beats may be gone, so dora is not asked."""
 _REFRESH_SECONDS = 0.5
 """The table of the head is written at most so often because of the members."""
+_HUNG = ("node-hung", "node-watchdog")
 _MOST_TAKEN = 4
 """Attempts in a row with ports that are taken on some machine."""
 _LONGEST = 300
@@ -65,7 +66,7 @@ class Roster:
     refresh: writes the table of the head, because that of a member is new. changed: set whenever
     something is new of a member. lost: the members that were lost in the run before this one.
     is_awaited: whether a person waits for this start, and can mend what a machine at its boot
-    cannot.
+    cannot. on_programs: is told what the nodes of a member run.
     """
 
     def __init__(self, options: RunnerOptions, ports: wire.Forwards) -> None:
@@ -77,6 +78,7 @@ class Roster:
         self.is_awaited = self._is_closed = False
         self._taken = 0
         self.push: Callable[[life.Event], None] = lambda _: None
+        self.on_programs: Callable[[str, str], None] = lambda _name, _digests: None
         self.refresh: Callable[[], None] = lambda: None
         self._is_refreshing = False
 
@@ -208,6 +210,8 @@ class Roster:
         elif isinstance(message, wire.Table):
             self._members[name].table = CellStatus.from_json(message.status)
             self._refresh_soon()
+        elif isinstance(message, wire.Programs | wire.Hung):
+            self._hear_of_nodes(name, message)
         elif isinstance(message, wire.Refused):
             self._give_up(name, message, Cause.MACHINE_REFUSES)
         elif isinstance(message, wire.Ended):
@@ -219,6 +223,19 @@ class Roster:
             self._unreached(name, message)
         elif isinstance(message, wire.Taken):
             self._take_others(name, message)
+
+    def _hear_of_nodes(self, name: str, message: wire.Programs | wire.Hung) -> None:
+        if isinstance(message, wire.Programs):
+            self.on_programs(name, message.digests)
+        else:
+            self._hung(name, message)
+
+    def _hung(self, name: str, message: wire.Hung) -> None:
+        """A member is believed for its own nodes, and for events that there are."""
+        is_own = placed_on(self._options.placed, message.node) == name
+        if is_own and message.record in _HUNG:
+            reason = short_line(message.reason, _LONGEST)
+            self.push(life.NodeHung(now_us(), message.node, reason, message.record))
 
     def _take_others(self, name: str, message: wire.Taken) -> None:
         """Begin again with other ports, unless that machine may forward none at all."""

@@ -163,7 +163,7 @@ def _origin(place: Place, settings: Place | None) -> Place:
     """The place of the dataflow file; that of the settings file beside it if that is not root's."""
     if settings is None:
         return place
-    return place if settings.uid == 0 and not settings.borrowed else settings
+    return settings if settings.changeable else place
 
 
 def project_root(path: Path, directory: str) -> str:

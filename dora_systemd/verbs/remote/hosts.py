@@ -45,9 +45,10 @@ def host_files(environment: Mapping[str, str]) -> list[Path]:
 def _read(path: Path) -> str:
     """Its text. Root logs in where only root has said so."""
     text = read_file(path)
-    if os.geteuid() == 0 and (text.place.uid != 0 or text.place.borrowed):
-        reason = text.place.borrowed or "the file is not root's"
+    if os.geteuid() == 0 and (reason := text.place.changeable):
         hint = f"name the hosts on the command line, or list them in {SYSTEM_HOSTS}"
+        if path == SYSTEM_HOSTS:
+            hint = f"chown root: {path}; chmod go-w {path}"
         raise DoraSystemdError(f"cannot use {path}: {reason}", hint, ExitCode.NO_PERMISSION)
     return decoded(text.data, path)
 

@@ -25,6 +25,10 @@ sshd_config(5)."""
 LOGIN_SECONDS = 15.0
 ANSWER_SECONDS = 90.0
 """For verbs that only look; each of them has shorter bounds of its own."""
+SHORT_SECONDS = 15.0
+"""For `list`, which asks systemd alone: one host that hangs must not hold back the table."""
+AGAIN_SECONDS = 5.0
+"""Before each attempt to follow a host again that was lost."""
 _TURN_SECONDS = 0.2
 _COMPLAINT = 4096
 
@@ -70,13 +74,14 @@ class Talk:
         silence: float | None = None,
     ) -> None:
         mark = f"doractl-{os.urandom(16).hex()}"
-        arguments = ssh_arguments(host, way, remote_command(way, words, mark))
+        arguments = ssh_arguments(host, way, remote_command(way, words, mark, host))
         self.host = host
         is_fed = way is Way.FED and opening is None
         self.connection = Connection(arguments, is_fed, is_here=not host.destination)
         self._outbox = itertools.chain([opening or b""])
         self._chunk = b""
         self._has_more = opening is not None
+        self._is_told = way is not Way.ONCE
         self._most, self._silence = most_seconds, silence
         self._deadline = time.monotonic() + LOGIN_SECONDS
         self._output, self._errors = AfterMark(mark), AfterMark(mark)
@@ -161,9 +166,10 @@ class Talk:
         status = self.connection.close()
         if self._refusal:
             return Ended(self.host, status, self._refusal, self.is_in)
-        what = ("no answer", self._most) if self.is_in else ("no login", LOGIN_SECONDS)
-        error = silent(self.host, what[1] or 0, what[0])
-        if self.is_in and self._silence is not None:
+        most = self._most or self._silence or 0
+        what = ("no answer", most) if self.is_in else ("no login", LOGIN_SECONDS)
+        error = silent(self.host, what[1], what[0])
+        if self.is_in and self._is_told and self._silence is not None:
             error = mute(self.host, self._silence)
         return Ended(self.host, status, error, self.is_in)
 
@@ -189,14 +195,17 @@ class Talks:
         self._waiting = deque(hosts)
         self._at_once = at_once or len(hosts)
         self._opening, self._silence = opening, silence
-        self._how = way, words, most_seconds
+        self._way, self._words, self._most = way, words, most_seconds
+        self._again: dict[Host, tuple[float, Sequence[str]]] = {}
         self._is_full = is_full
         self._live: list[Talk] = []
+        self._lost: set[Host] = set()
 
     @property
     def is_complete(self) -> bool:
         """Whether every host was reached or given up."""
-        return not self._waiting and all(one.is_in for one in self._live)
+        is_reached = (one.is_in or one.host in self._lost for one in self._live)
+        return not self._waiting and all(is_reached)
 
     @property
     def present(self) -> list[Host]:
@@ -209,9 +218,15 @@ class Talks:
             if one.host == host:
                 one.say(chunks)
 
+    def begin_again(self, host: Host, words: Sequence[str]) -> None:
+        """Talk with a host again that was lost, in a while, with these words."""
+        self._lost.add(host)
+        self._again[host] = time.monotonic() + AGAIN_SECONDS, words
+
     def begin_no_more(self) -> None:
         """Talk with no host that is still waiting."""
         self._waiting.clear()
+        self._again.clear()
 
     def hang_up(self) -> None:
         """End what follows, and let it say its last words."""
@@ -228,7 +243,7 @@ class Talks:
     def events(self) -> Iterator[Event]:
         """What happens, until all have ended. Raises DoraSystemdError if there is no ssh."""
         try:
-            while self._waiting or self._live:
+            while self._waiting or self._live or self._again:
                 self._admit()
                 yield from self._turn()
         finally:
@@ -237,8 +252,15 @@ class Talks:
 
     def _admit(self) -> None:
         while self._waiting and self._has_room():
-            host = self._waiting.popleft()
-            self._live.append(Talk(host, *self._how, self._opening, self._silence))
+            self._begin(self._waiting.popleft(), self._words)
+        now = time.monotonic()
+        for host in [one for one, (due, _) in self._again.items() if due <= now]:
+            _, words = self._again.pop(host)
+            self._begin(host, words)
+
+    def _begin(self, host: Host, words: Sequence[str]) -> None:
+        more = self._opening, self._silence
+        self._live.append(Talk(host, self._way, words, self._most, *more))
 
     def _has_room(self) -> bool:
         logins = sum(not one.is_in for one in self._live)

@@ -32,7 +32,7 @@ class SettingsFile:
     @property
     def is_roots(self) -> bool:
         """Whether only root can have written and placed the file."""
-        return self.place.uid == 0 and not self.place.borrowed
+        return not self.place.changeable
 
     def words(self) -> Mapping[object, object]:
         """Its keys."""
@@ -149,7 +149,7 @@ def _check_trust(read: SettingsFile) -> None:
 
 
 def _untrusted(read: SettingsFile, key: str, flag: str) -> DoraSystemdError:
-    reason = "the file is not root's" if read.place.uid != 0 else read.place.borrowed
+    reason = read.place.changeable
     return DoraSystemdError(
         f"cannot use {shown(str(read.path))}: {key} is set there, and {reason}",
         f"give {flag} on the command line, or set it in {SYSTEM_FILE}",

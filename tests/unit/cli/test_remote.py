@@ -228,3 +228,49 @@ def test_nothing_of_it_is_loaded_without_a_host() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[-1] == "loaded:"
+
+
+def test_a_doractl_that_hangs_there(capsys: Printed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds back neither the rows of the others nor, for ever, their lines."""
+    place = Path(os.environ["PATH"].partition(":")[0])
+    make_program(place / "doractl", '[ "$HOST" = h1 ] && exec sleep 1000\necho "[]"')
+    monkeypatch.setattr("dora_systemd.cli.remote.plan.SHORT_SECONDS", 0.5)
+    monkeypatch.setattr("dora_systemd.cli.remote.plan.ANSWER_SECONDS", 0.5)
+    for words in (["list"], ["logs", "robot"], ["releases"]):
+        assert main.run([*words, "-H", "h1,h2"]) == ExitCode.NO_HOST
+        out, err = capsys.readouterr()
+        assert err.startswith("doractl: cannot reach h1: no answer within 0.5s\n")
+        if words != ["logs", "robot"]:
+            rows = [line.split() for line in out.splitlines()[1:]]
+            assert [row[0] for row in rows] == ["h1"]
+            assert "Unreachable" in rows[0]
+
+
+def test_a_host_that_refuses_is_not_unreachable(capsys: Printed) -> None:
+    place = Path(os.environ["PATH"].partition(":")[0])
+    make_program(place / "doractl", 'echo "doractl: no release" >&2; exit 4')
+    assert main.run(["releases", "robot", "-H", "h1,h2"]) == ExitCode.NOT_FOUND
+    out, err = capsys.readouterr()
+    assert "Unreachable" not in out
+    assert sorted(err.splitlines()) == ["doractl: h1: no release", "doractl: h2: no release"]
+
+
+def test_logs_follow_a_host_again_that_is_back(
+    capsys: Printed, programs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = Path(os.environ["PATH"].partition(":")[0])
+    record = "printf '__REALTIME_TIMESTAMP=%d\\nSYSLOG_IDENTIFIER=robot/cam\\nMESSAGE=%s\\n\\n'"
+    make_program(
+        place / "doractl",
+        f"""echo "$*" >>"$0.asked"
+[ "$HOST" = h2 ] && {{ {record} 5 other; exit 0; }}
+[ -e "$0.lost" ] && {{ {record} 7000002 two; exit 0; }}
+touch "$0.lost"; {record} 7000001 one; exit 255""",
+    )
+    monkeypatch.setattr(talk, "AGAIN_SECONDS", 0.1)
+    assert main.run(["logs", "robot", "-f", "-n", "3", "-H", "h1,h2"]) == ExitCode.NO_HOST
+    out, err = capsys.readouterr()
+    assert sorted(line.split()[-1] for line in out.splitlines()) == ["one", "other", "two"]
+    assert err.startswith("doractl: the connection to h1 is lost")
+    again = programs.read_text().splitlines()[-1]
+    assert again.endswith("--since=@7.000002 -n all")

@@ -60,6 +60,14 @@ def test_a_lost_machine_ended_it() -> None:
     assert "doractl -H alice@gpu-box why robot" in text
 
 
+def test_a_policy_that_is_set_is_no_advice() -> None:
+    life = Life(FIRST.happenings[:-1])
+    found = examine([life], Facts("Failed", "", policy="on-failure"))
+    text = report_of(found)
+    assert "run: doractl restart robot\n" in text
+    assert "--restart-policy" not in text
+
+
 def test_a_part_that_its_head_ends() -> None:
     stopping = Happening("dataflow-stopping", 4_000_000, details={"by": "head"})
     told = (Happening("dataflow-starting", 1_000_000), stopping)

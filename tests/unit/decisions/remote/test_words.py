@@ -1,6 +1,7 @@
 """What -H names, and how it is taken out of a command line."""
 
 import subprocess
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -133,6 +134,19 @@ def test_the_command_of_ssh() -> None:
     assert words[words.index("-p") + 1] == "7"
     assert "BatchMode=yes" in words
     assert "BatchMode=yes" not in ssh_arguments(Host("b", "b"), Way.TERMINAL, command)
+
+
+@pytest.mark.parametrize("way", [Way.TERMINAL, Way.ONCE, Way.FED])
+def test_a_host_knows_how_it_was_called(way: Way, tmp_path: Path) -> None:
+    program = tmp_path / "doractl"
+    program.write_text('#!/bin/sh\necho "as $DORACTL_REACHED_AS: $*"\n')
+    program.chmod(0o755)
+    command = remote_command(way, ["list"], "mark", Host("a@b:7", "a@b", "7"))
+    environment = {"PATH": f"{tmp_path}:/usr/bin:/bin"}
+    done = subprocess.run(
+        ["sh", "-c", command], check=True, capture_output=True, env=environment, input=b""
+    )
+    assert b"as a@b:7: list\n" in done.stdout
 
 
 @pytest.mark.parametrize(

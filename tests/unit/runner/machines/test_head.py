@@ -1,6 +1,8 @@
 """A head: it waits for its members, and does without dora when one is lost."""
 
 import asyncio
+import hashlib
+import json
 import socket
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
@@ -312,3 +314,23 @@ def test_a_pid_of_another_machine_means_nothing_here(tmp_path: Path) -> None:
         assert bench.nodes.calls == [], "no process here is touched"
 
     run(tmp_path, work)
+
+
+def test_a_member_with_another_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "sink.py").write_text("new")
+    (tmp_path / "same.py").write_text("same")
+
+    async def work(bench: Bench) -> None:
+        digests = {
+            "sink.py": hashlib.sha256(b"old").hexdigest(),
+            "same.py": hashlib.sha256(b"same").hexdigest(),
+            "there.py": hashlib.sha256(b"there").hexdigest(),
+        }
+        await bench.link(READY, wire.Programs(json.dumps(digests)))
+        while not bench.heard(life.ReloadNoted):
+            await asyncio.sleep(0.01)
+        notice = "machine gpu runs another sink.py than the one here"
+        assert bench.heard(life.ReloadNoted) == [life.ReloadNoted(0, notice)]
+        assert bench.pipes.reasons("machine-differs") == [notice]
+
+    run(tmp_path, work, dataflow=str(tmp_path / "flow.yml"))

@@ -17,6 +17,7 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.life import Life
@@ -334,3 +335,23 @@ def test_a_daemon_without_a_head_is_killed(tmp_path: Path) -> None:
         assert not [one for one in bench.heard() if isinstance(one, life.ChildExited)]
 
     run(tmp_path, work, State.STOPPING)
+
+
+def test_the_head_hears_why_a_node_is_ended(tmp_path: Path) -> None:
+    """dora only tells it of the signal."""
+
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        bench.pump.on_event(life.NodeHung(0, "mid", "no sign of life for 5s", "node-watchdog"))
+        bench.pump.on_event(life.NodeReady(0, "mid"))
+        told = {"node": "mid", "reason": "no sign of life for 5s", "record": "node-watchdog"}
+        assert other.heard() == [{"type": "hung", **told}]
+
+    run(tmp_path, work)
+
+
+def test_only_the_head_decides_what_is_essential() -> None:
+    """Else the end of the part would come first, and look like the loss of its machine."""
+    rights = (NodeRights("mid", essential=True), NodeRights("mid", essential=True, nice=5))
+    member = Member(OPTIONS._replace(node_rights=rights), Life("uuid"), FakeBoot())
+    assert member.options.node_rights == (NodeRights("mid", nice=5),)

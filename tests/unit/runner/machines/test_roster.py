@@ -374,3 +374,23 @@ def test_another_run_has_other_ports_and_nothing_of_the_last_one() -> None:
         assert [one.get("coordinator") for one in again.heard()] == [62000], "and no old token"
 
     run(work)
+
+
+@pytest.mark.parametrize(
+    ("word", "is_believed"),
+    [
+        (wire.Hung("mid", "no sign of life for 5s", "node-watchdog"), True),
+        (wire.Hung("eye", "no sign of life for 5s", "node-watchdog"), False),
+        (wire.Hung("here", "no sign of life for 5s", "node-hung"), False),
+        (wire.Hung("mid", "no sign of life for 5s", "dataflow-failed"), False),
+    ],
+)
+def test_why_a_member_ends_a_node(word: wire.Hung, is_believed: bool) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, word)
+        await settle()
+        told = [life.NodeHung(0, word.node, word.reason, word.record)] if is_believed else []
+        assert bench.heard()[1:] == told
+
+    run(work)

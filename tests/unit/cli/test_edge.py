@@ -1,0 +1,26 @@
+"""What doractl prints for somebody who has called it from another machine."""
+
+import pytest
+
+from dora_systemd.cli import edge, group
+from dora_systemd.cli.edge import with_host
+
+
+@pytest.mark.parametrize(
+    ("text", "there"),
+    [
+        ("Use 'doractl stop robot' to stop", "Use 'doractl -H a@b:7 stop robot' to stop"),
+        ("hint: run: doractl --user restart x; doractl list", None),
+        ("the same version of doractl on both", "the same version of doractl on both"),
+        ("doractl: no dataflow named 'x'", "doractl: no dataflow named 'x'"),
+        ("doractl -H c why x", "doractl -H c why x"),
+    ],
+)
+def test_commands_are_for_the_host_they_are_about(text: str, there: str | None) -> None:
+    wanted = there or "hint: run: doractl -H a@b:7 --user restart x; doractl -H a@b:7 list"
+    assert with_host(text, "a@b:7") == wanted
+    assert with_host(text, "") == text
+
+
+def test_all_verbs_are_known() -> None:
+    assert set(edge.VERBS) == group.VERBS.keys()
