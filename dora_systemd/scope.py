@@ -19,6 +19,14 @@ class Scope(NamedTuple):
         """The parent of all RuntimeDirectory= of the manager, see systemd.exec(5)."""
         return Path(f"/run/user/{self.uid}") if self.is_user else Path("/run")
 
+    @property
+    def state_root(self) -> Path:
+        """The parent of all StateDirectory= of the manager, see systemd.exec(5)."""
+        if not self.is_user:
+            return Path("/var/lib")
+        home, given = os.environ.get("HOME", ""), os.environ.get("XDG_STATE_HOME", "")
+        return Path(given if given.startswith("/") else f"{home}/.local/state")
+
     def cell_directory(self, name: str) -> Path:
         """The RuntimeDirectory of the unit of dataflow `name`."""
         return self.runtime_root / RUNTIME_NAME / name

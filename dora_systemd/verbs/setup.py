@@ -107,7 +107,7 @@ def packaged_unit(scope: Scope) -> str:
 
 def leave_no_state(scope: Scope) -> None:
     """Remove the directories of the system's releases, unless there are releases in them."""
-    place = store_root(False)
+    place = store_root()
     for directory in () if scope.is_user else (place, place.parent):
         remove_empty(directory)
 
@@ -133,7 +133,7 @@ def tell_systemd(reach: Callable[[Scope], Manager], scope: Scope) -> tuple[str, 
         reach(scope).reload()
     if scope.is_user:
         return ()
-    state = ["systemd-tmpfiles", "--create", f"--prefix={store_root(False).parent}"]
+    state = ["systemd-tmpfiles", "--create", f"--prefix={store_root().parent}"]
     commands = (["systemd-sysusers"], state, ["journalctl", "--update-catalog"])
     return tuple(filter(None, map(_run, commands)))
 

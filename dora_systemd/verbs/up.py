@@ -57,7 +57,7 @@ def make_state(scope: Scope) -> None:
     """
     with suppress(OSError):  # of all that the gateway does, only a rollback needs it
         if not scope.is_user:
-            make_directories(store_root(False).parent)
+            make_directories(store_root().parent)
 
 
 def open_port(manager: Manager, scope: Scope, port: int | None) -> int:

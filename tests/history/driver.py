@@ -172,7 +172,7 @@ class Driver:
         for cell in CELLS:
             Cell(cell).doractl("disable", cell, check=False)
             Cell(cell).end()
-            shutil.rmtree(store_root(is_user=False) / cell, ignore_errors=True)
+            shutil.rmtree(store_root() / cell, ignore_errors=True)
         member.forget(self.scene.root)
         self.scene.front.end()
 

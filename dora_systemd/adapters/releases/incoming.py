@@ -14,8 +14,6 @@ from dora_systemd.errors import DoraSystemdError
 
 _NAME = ".sent"
 """No dataflow has such a name."""
-_SECONDS = 90.0
-"""Timeout for more bytes: the sender may be stopped, or gone without a word."""
 _YOUNG_SECONDS = 60.0
 _RACES = 20
 """Of others that remove the shared directory just then; each of them has ended then."""
@@ -23,10 +21,14 @@ _CHUNK = 256 * 1024
 
 
 class Stream:
-    """The bytes of a file descriptor. All methods raise DoraSystemdError at an early end."""
+    """The bytes of a file descriptor. All methods raise DoraSystemdError at an early end.
 
-    def __init__(self, fd: int) -> None:
+    seconds: timeout for more bytes: the sender may be stopped, or gone without a word.
+    """
+
+    def __init__(self, fd: int, seconds: float = 90.0) -> None:
         self._fd = fd
+        self._seconds = seconds
         self._held = b""
 
     def line(self, most: int) -> bytes:
@@ -57,8 +59,8 @@ class Stream:
                 pass
 
     def _more(self) -> bytes:
-        if not select.select([self._fd], [], [], _SECONDS)[0]:
-            raise _broken(f"no more of it came for {_SECONDS:g}s")
+        if not select.select([self._fd], [], [], self._seconds)[0]:
+            raise _broken(f"no more of it came for {self._seconds:g}s")
         if not (data := os.read(self._fd, _CHUNK)):
             raise _broken("it ended too early")
         return data

@@ -42,15 +42,9 @@ _REMOVE_SECONDS = 300.0
 SYSTEM_STATE = Path("/var/lib")
 
 
-def store_root(is_user: bool, environment_home: str = "", state_home: str = "") -> Path:
-    """The directory of the releases of all dataflows.
-
-    environment_home, state_home: the variables HOME and XDG_STATE_HOME, for user scope.
-    """
-    if not is_user:
-        return SYSTEM_STATE / STORE
-    home = state_home if state_home.startswith("/") else f"{environment_home}/.local/state"
-    return Path(home) / STORE
+def store_root(state_root: Path = SYSTEM_STATE) -> Path:
+    """The directory of the releases of all dataflows. state_root: that of the scope."""
+    return state_root / STORE
 
 
 class Store:

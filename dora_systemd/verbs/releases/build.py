@@ -70,6 +70,10 @@ class Build:
         """The unit that it runs in."""
         return build_unit(self.store.name)
 
+    def sent(self, manager: Manager, tree: BuildTree, reading: int) -> list[Property]:
+        """The properties of the unit. reading: its standard input."""
+        return _sent(manager, self, tree, reading)
+
     @property
     def place(self) -> Path:
         """Where its files will be, and where the build sees them already."""
@@ -129,7 +133,7 @@ def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
 
 def _start(manager: Manager, build: Build, tree: BuildTree, reading: int) -> None:
     try:
-        sent = _sent(manager, build, tree, reading)
+        sent = build.sent(manager, tree, reading)
         manager.start_transient(build.unit, sent, None, wait=False)
     finally:
         os.close(reading)
@@ -211,7 +215,6 @@ def _refusal(
 
 
 def _sent(manager: Manager, build: Build, tree: BuildTree, reading: int) -> list[Property]:
-    """The properties of the unit. reading: its standard input."""
     plan, place = build.source.plan, build.place
     directory = str(PurePath(place, build.source.dataflow).parent)
     commands = tuple(tuple(one) for one in build.commands)

@@ -5,11 +5,11 @@ deploy and rollback both end here, so this is the one place for what may forbid 
 
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from dora_systemd.adapters.bus.manager import SETTLED, UP, Manager, Observer
 from dora_systemd.adapters.bus.systemd import Bus
@@ -59,10 +59,26 @@ class Change:
     by: str
 
 
+class Trial(Protocol):
+    """What judges a release: a Gate."""
+
+    def run(self, start_limit: int, soak: int) -> Fault | None:
+        """Start it and watch it for `soak` µs; None if all is well. Raises DoraSystemdError."""
+
+
+MakeTrial = Callable[[Manager, Scope, RunnerOptions, Tell], Trial]
+
+
 def change_release(
-    manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
+    manager: Manager,
+    scope: Scope,
+    store: Store,
+    standing: Standing,
+    change: Change,
+    tell: Tell,
+    make_trial: MakeTrial = Gate,
 ) -> None:
-    """Run the release, and commit it or roll back.
+    """Run the release, and commit it or roll back. make_trial: gives what judges it.
 
     Raises DoraSystemdError: ROLLED_BACK if it has failed its trial; INHIBITED before that, and
     NOT_RUNNING if what ran has ended in a wait. SIGINT, SIGTERM and SIGHUP roll back, too.
@@ -77,21 +93,26 @@ def change_release(
         if not standing.running:
             # As an ended unit of doractl start is unloaded, systemd would remove the trial's file.
             make_room(manager, standing.boot)
-        _try(manager, scope, store, standing, change, tell)
+        trial = make_trial(manager, scope, change.options, tell)
+        _try(manager, scope, store, standing, change, tell, trial)
 
 
 def _try(
-    manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
+    manager: Manager,
+    scope: Scope,
+    store: Store,
+    standing: Standing,
+    change: Change,
+    tell: Tell,
+    trial: Trial,
 ) -> None:
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
     mark, life = _Mark(store, change.release), read_life(manager, standing.boot.unit)
-    begun = partial(_end_killed, scope, standing, change, life, mark)
+    begun = partial(_end_alone, scope, standing, change, life, mark)
     with guarded(begun, store.lock), _interruptible():
         _begin(manager, standing, change.text)
         try:
-            fault = Gate(manager, scope, change.options, tell).run(
-                _limit(change.options), change.soak
-            )
+            fault = trial.run(_limit(change.options), change.soak)
             if fault is None:
                 _ignore_signals()
                 mark.make()
@@ -183,12 +204,19 @@ def _roll_back(
     )
 
 
-def _end_killed(scope: Scope, standing: Standing, change: Change, life: str, mark: _Mark) -> None:
+def _end_alone(scope: Scope, standing: Standing, change: Change, life: str, mark: _Mark) -> None:
+    # The other's connection is of no use, see sd_bus_new(3).
+    end_killed(Bus(scope), scope, standing, change, life, mark)
+
+
+def end_killed(
+    manager: Manager, scope: Scope, standing: Standing, change: Change, life: str, mark: _Mark
+) -> None:
     """Go back after this process was killed, unless the release was committed before that.
 
     life: of the unit before the trial. What has not been touched goes on.
     """
-    manager, unit = Bus(scope), standing.boot.unit  # the other's is of no use, see sd_bus_new(3)
+    unit = standing.boot.unit
     now = read_standing(manager, scope, unit)
     if now.current == change.release != standing.current:
         commit(manager, now, change.text, change.want_boot)  # it may lack its link

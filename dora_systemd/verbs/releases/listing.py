@@ -1,6 +1,5 @@
 """`doractl releases`: the releases in the store, and which of them runs."""
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -26,8 +25,7 @@ _MOST_NAMES = 10_000
 
 def root_of(scope: Scope) -> Path:
     """The directory of the releases of all dataflows."""
-    home, state = os.environ.get("HOME", ""), os.environ.get("XDG_STATE_HOME", "")
-    return store_root(scope.is_user, home, state)
+    return store_root(scope.state_root)
 
 
 def store_of(scope: Scope, name: str) -> Store:

@@ -44,7 +44,7 @@ class Packed(NamedTuple):
     spool: Spool
 
 
-class _Sender(NamedTuple):
+class Sender(NamedTuple):
     """A project here. directory: its working directory, "" for that of the dataflow file.
 
     beside: what the settings file beside that says, None without one.
@@ -60,11 +60,15 @@ class _Sender(NamedTuple):
 
 @contextlib.contextmanager
 def packed(
-    request: StartRequest, tell: Callable[[str], None], warn: Callable[[str], None]
+    request: StartRequest,
+    tell: Callable[[str], None],
+    warn: Callable[[str], None],
+    find_reader: Callable[[Sender], Account | None] | None = None,
 ) -> Iterator[Packed]:
     """The project that `request` names, which nobody changes any more.
 
-    tell: gets each stage; warn: each warning. Raises DoraSystemdError.
+    tell: gets each stage; warn: each warning. find_reader: gives the account that reads it. Raises
+    DoraSystemdError.
     """
     sender = _find(request)
     if note := _venv_note(sender):
@@ -78,7 +82,7 @@ def packed(
         tell(f"packing: {format_rounded_size(done)} of {format_rounded_size(total)}")
 
     with spooled() as spool:
-        reader = _reader(sender)
+        reader = (find_reader or _reader)(sender)
         with opened_project(root, reader) as project:
             found, revision = find_files(project, named, _owners(reader))
             if reader is None and os.geteuid() == 0:
@@ -97,7 +101,7 @@ def packed(
         yield Packed(parcel, spool)
 
 
-def _find(request: StartRequest) -> _Sender:
+def _find(request: StartRequest) -> Sender:
     path, written, dataflow = read_dataflow(request)
     beside = Path(settings_path(str(path)))
     read = read_settings_file(beside) if exists(beside) else None
@@ -109,7 +113,7 @@ def _find(request: StartRequest) -> _Sender:
     directory = "" if given is None else os.path.normpath(Path(given).absolute())
     root = project_root(path, directory or str(path.parent))
     said = read.data if read else None
-    return _Sender(written.place, dataflow, settings, root, directory, said)
+    return Sender(written.place, dataflow, settings, root, directory, said)
 
 
 def _require_trusted(read: SettingsFile) -> None:
@@ -126,7 +130,7 @@ def _require_trusted(read: SettingsFile) -> None:
             raise DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
 
 
-def _require_same(sender: _Sender, files: Mapping[str, Stored]) -> None:
+def _require_same(sender: Sender, files: Mapping[str, Stored]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) unless the settings that were checked are in the parcel.
 
     The account that reads the project for root can change them meanwhile, or lie about them.
@@ -149,7 +153,7 @@ def _behind_links(path: str, files: Mapping[str, Stored]) -> Stored | None:
     return one
 
 
-def _venv_note(sender: _Sender) -> str:
+def _venv_note(sender: Sender) -> str:
     """The warning for a virtual environment that a deploy here would use, or ""."""
     venv = str(Path(sender.dataflow.source).parent / ".venv")
     if sender.settings.is_given(VENV) or not exists(f"{venv}/bin/python"):
@@ -157,7 +161,7 @@ def _venv_note(sender: _Sender) -> str:
     return f"{shown(venv)} stays here: name a virtual environment of the hosts with --venv"
 
 
-def _reader(sender: _Sender) -> Account | None:
+def _reader(sender: Sender) -> Account | None:
     """Who reads the project, None for the caller: never root what others can change."""
     try:
         pwd.getpwnam(DEFAULT_USER)

@@ -5,7 +5,7 @@ journal tells as well: every crash and restart of a node is an event there.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -63,14 +63,25 @@ def settle(
 
 
 class Gate:
-    """The trial of a dataflow. options: of the release. tell: gets each step."""
+    """The trial of a dataflow. options: of the release. tell: gets each step.
 
-    def __init__(self, manager: Manager, scope: Scope, options: RunnerOptions, tell: Tell) -> None:
+    hear: as read_heard().
+    """
+
+    def __init__(
+        self,
+        manager: Manager,
+        scope: Scope,
+        options: RunnerOptions,
+        tell: Tell,
+        hear: Callable[[Scope, str, Sequence[Owed]], Sequence[int]] = read_heard,
+    ) -> None:
         self._manager = manager
         self._scope = scope
         self._options = options
         self._unit = unit_name(options.name)
         self._tell = tell
+        self._hear = hear
         # The other clock can be set back meanwhile, and then nothing would be since then.
         self._since_monotonic_us = time.monotonic_ns() // _MICROSECOND_NS
         self._boot = now_boot()
@@ -145,7 +156,7 @@ class Gate:
     def _unheard(self) -> Owed | None:
         """The owed output that the trial has to wait for the longest, if any has not come yet."""
         owes = self._options.owes
-        pairs = zip(owes, read_heard(self._scope, self._options.name, owes), strict=True)
+        pairs = zip(owes, self._hear(self._scope, self._options.name, owes), strict=True)
         late = (one for one, at in pairs if at < self._since_monotonic_us)
         return max(late, key=lambda one: one.first, default=None)
 

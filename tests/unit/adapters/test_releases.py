@@ -20,6 +20,7 @@ from dora_systemd.decisions.releases.choice import Known
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
 
 ONE, TWO = "20261121T220012", "20261122T220012"
 
@@ -150,11 +151,22 @@ def test_a_store_that_is_not_there(tmp_path: Path) -> None:
         store.manifest(ONE)
 
 
-def test_where_it_is() -> None:
-    assert store_root(False, "/x", "/y") == Path("/var/lib/dora-systemd/releases")
-    assert store_root(True, "/x", "") == Path("/x/.local/state/dora-systemd/releases")
-    assert store_root(True, "/x", "/y") == Path("/y/dora-systemd/releases")
-    assert store_root(True, "/x", "relative") == Path("/x/.local/state/dora-systemd/releases")
+@pytest.mark.parametrize(
+    ("is_user", "state", "place"),
+    [
+        (False, "/y", "/var/lib"),
+        (True, "", "/x/.local/state"),
+        (True, "/y", "/y"),
+        (True, "relative", "/x/.local/state"),
+    ],
+)
+def test_where_it_is(
+    is_user: bool, state: str, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/x")
+    monkeypatch.setenv("XDG_STATE_HOME", state)
+    found = store_root(Scope(is_user, 1000).state_root)
+    assert found == Path(place, "dora-systemd/releases")
 
 
 def test_whether_somebody_changes_a_store(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from dora_systemd.scope import Scope
 
 
 class ScopeIn(Scope):
-    """A scope whose runtime directories are below `root`."""
+    """A scope whose runtime directories are below `root`, and its state in `root` / state."""
 
     root: Path
 
@@ -25,6 +25,10 @@ class ScopeIn(Scope):
     @property
     def runtime_root(self) -> Path:
         return self.root
+
+    @property
+    def state_root(self) -> Path:
+        return self.root / "state"
 
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"

@@ -171,11 +171,9 @@ def test_a_time_that_journalctl_does_not_take(bench: Bench, tmp_path: Path) -> N
 
 def test_the_releases_of_a_dataflow(bench: Bench) -> None:
     bench.journal()
-    bench.scope = ScopeIn(is_user=True, uid=os.getuid(), root=bench.root)
-    state = bench.root / "state\x1b[2J"
-    bench.patch.setenv("XDG_STATE_HOME", str(state))
+    bench.scope = ScopeIn(is_user=False, uid=os.getuid(), root=bench.root / "x\x1b[2J")
     for number in range(1, MAX_ITEMS + 50):
         store_of(bench.scope, "robot").tree(f"2026{number:04}T220012").mkdir(parents=True)
     found = read_own_releases(bench.scope, UUID)["releases"]
     assert (len(found), found[0]["release"]) == (MAX_ITEMS, f"2026{MAX_ITEMS + 49:04}T220012")
-    assert found[0]["tree"].startswith(f"{bench.root}/state/")
+    assert found[0]["tree"].startswith(f"{bench.root}/x/state/")

@@ -85,7 +85,7 @@ def test_names_of_slice_and_user() -> None:
 
 def test_no_unit_owns_the_releases() -> None:
     """systemctl clean removes what a unit owns; the gateway only writes there."""
-    place = str(store_root(False).parent)
+    place = str(store_root().parent)
     texts = {path.name: path.read_text() for path in TEMPLATES.iterdir()}
     assert not [name for name, text in texts.items() if re.search("^StateDirectory=", text, re.M)]
     assert f"\nReadWritePaths=-{place}\n" in texts["dora-gateway-sandbox.conf"]

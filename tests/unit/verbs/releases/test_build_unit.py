@@ -11,7 +11,7 @@ from dora_systemd.verbs.releases import build as module
 from tests.unit.fakes.manager import FakeManager
 
 UNIT = "doractl-build-robot.service"
-BUILD: Any = SimpleNamespace(unit=UNIT)
+BUILD: Any = SimpleNamespace(unit=UNIT, sent=lambda *_: [])
 
 
 class Silent(FakeManager):
@@ -40,8 +40,6 @@ def test_a_start_whose_answer_is_lost(monkeypatch: pytest.MonkeyPatch, stop: str
         return done
 
     monkeypatch.setattr(manager, "run_jobs", end)
-    monkeypatch.setattr(module, "end_former", lambda *_: None)
-    monkeypatch.setattr(module, "_sent", lambda *_: [])
     before = open_files()
     with pytest.raises(DoraSystemdError, match="no answer"):
         module._run(manager, BUILD, BUILD)

@@ -12,7 +12,6 @@ from dora_systemd.decisions.releases.entries import Found, Stored
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.project import Project, opened_project
-from dora_systemd.verbs.releases import files as module
 from dora_systemd.verbs.releases.files import copy_files, digests, find_files
 
 FIRST = "20261121T220012"
@@ -70,12 +69,6 @@ def test_a_repository_in_the_repository(root: Path, project: Project) -> None:
     for directory in (root, root / "models"):
         subprocess.run(["git", "init", "-q"], cwd=directory, check=True)
     assert "models/m.onnx" in find_files(project, [], [])[0]
-
-
-def test_too_many(project: Project, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MOST_FILES", 2)
-    with pytest.raises(DoraSystemdError, match="more than"):
-        find_files(project, [], [])
 
 
 class Many:

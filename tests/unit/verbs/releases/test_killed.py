@@ -1,5 +1,6 @@
 """What the child of a doractl that was killed does, before and after the commit."""
 
+import socket
 from functools import partial
 
 import pytest
@@ -30,16 +31,14 @@ CHANGE = Change(
 
 
 @pytest.fixture
-def end(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> "partial[None]":
+def end(manager: FakeManager, scope: Scope, store: Store) -> "partial[None]":
     """The end of a change that has begun with the old release."""
-    monkeypatch.setattr(module, "Bus", lambda _: manager)
     deployed(manager)
     standing = read_standing(manager, scope, UNIT)
     begin_trial(manager, standing, text_of(NEW))
     mark = module._Mark(store, NEW)
-    return partial(module._end_killed, scope, standing, CHANGE, read_life(manager, UNIT), mark)
+    life = read_life(manager, UNIT)
+    return partial(module.end_killed, manager, scope, standing, CHANGE, life, mark)
 
 
 def now(manager: FakeManager, scope: Scope) -> Standing:
@@ -49,10 +48,10 @@ def now(manager: FakeManager, scope: Scope) -> Standing:
 
 
 @pytest.fixture
-def notes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def notes(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
     """The events that are written."""
-    notes: list[str] = []
-    monkeypatch.setattr(module, "note_request", lambda name, *_, **__: notes.append(name))
+    notes: list[bytes] = []
+    monkeypatch.setattr(socket.socket, "sendto", lambda _, data, *__: notes.append(data))
     return notes
 
 
@@ -73,7 +72,7 @@ def test_before_the_commit(
 
 
 def test_before_systemd_was_told(
-    manager: FakeManager, scope: Scope, end: "partial[None]", notes: list[str]
+    manager: FakeManager, scope: Scope, end: "partial[None]", notes: list[bytes]
 ) -> None:
     """What runs has not been touched, so it goes on; and nobody tells of a trial."""
     end()

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.releases import incoming as module
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.incoming import Stream, incoming, leftovers
 from dora_systemd.adapters.releases.spool import spooled
+from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.parcel import Parcel, format_parcel
@@ -19,6 +19,10 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import receive
 from dora_systemd.verbs.releases.receive import Known, _fill
 from tests.unit.fakes.manager import FakeManager
+from tests.unit.verbs.releases.test_trial import NEW as NEW_ID
+from tests.unit.verbs.releases.test_trial import store
+
+__all__ = ["store"]
 
 
 def stream_of(data: bytes) -> Stream:
@@ -63,15 +67,16 @@ def test_what_is_here_already_is_shared(tmp_path: Path) -> None:
 
 
 def test_what_a_build_has_made_is_not_removed(
-    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, store: Store
 ) -> None:
     """A dry run compares projects, as one without -H."""
     files = {"gone": OLD, "copy": OLD, ".venv/pyvenv.cfg": replace(NEW, is_built=True)}
-    last = Manifest("1", "robot", "", "dataflow.yml", "", "", "", 0, files=files)
-    monkeypatch.setattr(receive, "present", lambda *_: last)
+    store.release(NEW_ID).rmdir()
+    last = Manifest(NEW_ID, "robot", "u", "dataflow.yml", "/srv", "", "", 1, files=files)
+    Draft(store).publish(last, None)
     parcel = Parcel("robot", "", "copy", None, "", {"copy": NEW})
     found = receive.compare_sent(manager, scope, stream_of(format_parcel(parcel)))
-    assert found == ("1", {"added": [], "changed": ["copy"], "removed": ["gone"]})
+    assert found == (NEW_ID, {"added": [], "changed": ["copy"], "removed": ["gone"]})
 
 
 @pytest.mark.parametrize("data", [b"", b"new", b"other"])
@@ -113,11 +118,10 @@ def test_a_stream() -> None:
     stream.wait_for_end()
 
 
-def test_nobody_sends_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_SECONDS", 0.0)
+def test_nobody_sends_any_more() -> None:
     read, write = os.pipe()
     with pytest.raises(DoraSystemdError, match="no more of it came"):
-        Stream(read).line(10)
+        Stream(read, 0.0).line(10)
     os.close(write)
 
 
@@ -126,23 +130,27 @@ def test_another_sender_ends_while_this_one_begins(
 ) -> None:
     """It removes the directory that both share."""
 
-    def end(_store: object) -> None:
-        (tmp_path / ".sent").rmdir()
+    change_mode = Path.chmod
+
+    def end(path: Path, mode: int) -> None:
+        change_mode(path, mode)
+        path.rmdir()
         monkeypatch.undo()
 
-    monkeypatch.setattr(module, "_clean", end)
+    monkeypatch.setattr(Path, "chmod", end)
     with incoming(tmp_path) as draft:
         assert draft.tree.is_dir()
         assert (tmp_path / ".sent").stat().st_mode & 0o777 == 0o711
     assert not [*tmp_path.iterdir()]
 
 
-def test_what_a_killed_one_has_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_killed_one_has_left(tmp_path: Path) -> None:
     """It goes, unless somebody is still at it."""
     with incoming(tmp_path) as other:
         left = Draft(other._store)
         assert leftovers(tmp_path) == []
-        monkeypatch.setattr(module, "_YOUNG_SECONDS", -1.0)
+        for one in (left, other):
+            os.utime(one.tree.parent, (0, 0))
         assert leftovers(tmp_path) == [left.tree.parent]
         with incoming(tmp_path):
             assert not left.tree.exists()

@@ -28,11 +28,8 @@ def leave(path: Path, age: float) -> Path:
     return left
 
 
-def test_what_is_left(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_left(manager: FakeManager, scope: Scope, store: Store) -> None:
     deployed(manager)
-    monkeypatch.setattr(module, "root_of", lambda _: store.path.parent)
     store.release(OLD).mkdir()  # without a unit file, but it is what runs
     (store.path / "notes").touch()
     draft = store.path / ".new-0a1b2c3d4e5f"
@@ -65,9 +62,8 @@ def test_what_is_being_written_stays(manager: FakeManager, scope: Scope, store: 
 
 
 def test_a_foreign_unit_hides_no_other_dataflow(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, store: Store
 ) -> None:
-    monkeypatch.setattr(module, "root_of", lambda _: store.path.parent)
     other = store.path.with_name("other")
     (other / OLD).mkdir(parents=True)
     foreign = etc(manager).with_name("dora-other.service")

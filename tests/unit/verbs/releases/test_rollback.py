@@ -1,6 +1,7 @@
 """What a rollback does to a dataflow without a release before the present one, or disabled."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -9,10 +10,9 @@ from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.releases import rollback as module
-from dora_systemd.verbs.releases.change import Change
 from dora_systemd.verbs.releases.rollback import roll_back
 from dora_systemd.verbs.releases.trial import read_standing
+from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.verbs.releases.test_trial import NEW, OLD, UNIT, release_options, store, text_of
 
@@ -20,14 +20,13 @@ __all__ = ["store"]
 
 
 @pytest.fixture(autouse=True)
-def _known(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def _known(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeJournal(monkeypatch, tmp_path)
     store.release(NEW).rmdir()
     for release in (OLD, NEW):
         draft = Draft(store)
         draft.publish(Manifest(release, "robot", "u", "dataflow.yml", "/srv", "", "", 1), None)
         store.write_unit(release, text_of(release))
-    monkeypatch.setattr(module, "store_of", lambda *_: store)
-    monkeypatch.setattr(module, "deployed_names", lambda *_: ["robot"])
 
 
 @pytest.mark.parametrize("active", ["active", "failed"])
@@ -45,23 +44,13 @@ def test_a_first_trial_that_was_killed_ends(
     assert "RestartUnit" not in [call[0] for call in manager.calls]
 
 
-@pytest.fixture
-def changes(monkeypatch: pytest.MonkeyPatch) -> list[Change]:
-    """Those that are asked for; nothing makes them."""
-    found: list[Change] = []
-    monkeypatch.setattr(module, "change_release", lambda *given: found.append(given[4]))
-    return found
-
-
-def test_what_is_disabled_stays_so(
-    manager: FakeManager, scope: Scope, changes: list[Change]
-) -> None:
+def test_what_is_disabled_stays_so(manager: FakeManager, scope: Scope) -> None:
     manager.add(release_options(NEW), "active", Transient=False)
     roll_back(manager, scope, "robot", OLD, 0, print)
-    assert [one.want_boot for one in changes] == [False]
+    standing = read_standing(manager, scope, UNIT)
+    assert (standing.current, standing.boot.is_enabled) == (OLD, False)
 
 
-@pytest.mark.usefixtures("changes")
 @pytest.mark.parametrize("damage", ["other", "", None])
 def test_a_damaged_release_is_refused(
     manager: FakeManager, scope: Scope, store: Store, damage: str | None
@@ -74,7 +63,8 @@ def test_a_damaged_release_is_refused(
     for name in files:
         (tree / name).write_bytes(b"model")
     store.write_manifest(replace(store.manifest(OLD), files=files))
-    roll_back(manager, scope, "robot", OLD, 0, print)
+    for release in (OLD, NEW):
+        roll_back(manager, scope, "robot", release, 0, print)
     if damage is None:
         (tree / "b.onnx").unlink()
     else:

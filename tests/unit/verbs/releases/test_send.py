@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.programs import own_account
+from dora_systemd.trust.programs import Account, own_account
 from dora_systemd.verbs.releases import send
-from dora_systemd.verbs.releases.files import find_files
 from dora_systemd.verbs.start.plan import StartRequest
 
 FLOW = "nodes: [{id: a, path: a.py}]\n"
@@ -20,10 +19,8 @@ pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="gives files to somebo
 
 
 @pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project of another user, whom this reads it as."""
-    monkeypatch.setattr(send, "_reader", lambda _: own_account())
-    monkeypatch.setattr(send, "_owners", lambda _: [])
+def project(tmp_path: Path) -> Path:
+    """A project of another user."""
     root = tmp_path / "robot"
     root.mkdir()
     for name, text in (("robot.yml", FLOW), ("a.py", ""), ("robot.systemd.yml", MODEST)):
@@ -33,20 +30,16 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return root
 
 
-def pack(project: Path) -> dict[str, Any]:
+def pack(project: Path, meanwhile: Callable[[], object] = bool) -> dict[str, Any]:
+    """Pack it. meanwhile: happens when the settings are checked, and not packed yet."""
     request = StartRequest(str(project / "robot.yml"))
-    with send.packed(request, lambda _: None, lambda _: None) as found:
+
+    def find_reader(_sender: object) -> Account:
+        meanwhile()
+        return own_account()  # the other user cannot reach the directory
+
+    with send.packed(request, lambda _: None, lambda _: None, find_reader) as found:
         return dict(found.parcel.files)
-
-
-def once(monkeypatch: pytest.MonkeyPatch, act: Callable[[], object]) -> None:
-    """Have something happen after the settings are checked, and before they are packed."""
-
-    def find(*arguments: Any) -> Any:
-        act()
-        return find_files(*arguments)
-
-    monkeypatch.setattr(send, "find_files", find)
 
 
 def test_a_project_of_another_user(project: Path) -> None:
@@ -65,26 +58,20 @@ def test_settings_that_only_root_may_have(project: Path) -> None:
 
 
 @pytest.mark.parametrize("first", [MODEST, None])
-def test_settings_that_change_after_the_check(
-    project: Path, monkeypatch: pytest.MonkeyPatch, first: str | None
-) -> None:
+def test_settings_that_change_after_the_check(project: Path, first: str | None) -> None:
     """Over there they would be root's."""
     beside = project / "robot.systemd.yml"
     if first is None:
         beside.unlink()
-    once(monkeypatch, lambda: beside.write_text(IMMODEST))
     with pytest.raises(DoraSystemdError, match="changed while it was packed") as caught:
-        pack(project)
+        pack(project, lambda: beside.write_text(IMMODEST))
     assert caught.value.code is ExitCode.BAD_INPUT
 
 
-def test_settings_that_are_hidden_after_the_check(
-    project: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_settings_that_are_hidden_after_the_check(project: Path) -> None:
     beside = project / "robot.systemd.yml"
-    once(monkeypatch, beside.unlink)
     with pytest.raises(DoraSystemdError, match="changed while it was packed"):
-        pack(project)
+        pack(project, beside.unlink)
 
 
 def test_settings_behind_a_link_of_roots(project: Path) -> None:

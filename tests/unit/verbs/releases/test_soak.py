@@ -2,18 +2,20 @@
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.releases.progress import Step
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
-from dora_systemd.verbs.releases import soak as module
+from dora_systemd.verbs.facts.lives import now_boot
 from dora_systemd.verbs.releases.soak import Gate
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, options
 
 HUNG = "the supervisor process hung and was killed by the watchdog"
@@ -33,7 +35,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 def soaked(
     manager: FakeManager,
     scope: Scope,
-    monkeypatch: pytest.MonkeyPatch,
     clock: list[float],
     comes: tuple[float, ...],
 ) -> tuple[Fault | None, list[Step]]:
@@ -41,7 +42,7 @@ def soaked(
     runner = options(owes=(IMAGE, DEPTH)[: len(comes)])
     manager.add(runner, InvocationID=b"")
     told: list[Step] = []
-    gate, begun = Gate(manager, scope, runner, told.append), clock[0]
+    begun = clock[0]
 
     def heard(*_: object) -> tuple[int, ...]:
         last = 5 if clock[0] < begun else 0  # of what ran before
@@ -49,36 +50,34 @@ def soaked(
             int((begun + one) * SECOND) if clock[0] >= begun + one else last for one in comes
         )
 
-    monkeypatch.setattr(module, "read_heard", heard)
-    monkeypatch.setattr(Gate, "_fault", lambda _: None)
-    return gate._soak(2 * SECOND), told
+    return Gate(manager, scope, runner, told.append, heard)._soak(2 * SECOND), told
 
 
+@pytest.mark.usefixtures("journal")
 @pytest.mark.parametrize(
     ("comes", "seconds"), [((), 2), ((0.5,), 2), ((2.5,), 2.6), ((2.5, 0.1), 2.6)]
 )
 def test_it_lasts_until_all_has_come(
     manager: FakeManager,
     scope: Scope,
-    monkeypatch: pytest.MonkeyPatch,
     clock: list[float],
     comes: tuple[float, ...],
     seconds: float,
 ) -> None:
-    found, told = soaked(manager, scope, monkeypatch, clock, comes)
+    found, told = soaked(manager, scope, clock, comes)
     assert found is None
     assert clock[0] - 1000 == pytest.approx(seconds, abs=0.21)
     assert any("waits for camera/image" in one.text for one in told) == (seconds > 2)
 
 
-def test_what_never_comes_fails_it(
-    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch, clock: list[float]
-) -> None:
-    found, _ = soaked(manager, scope, monkeypatch, clock, (1e6, 0.1))
+@pytest.mark.usefixtures("journal")
+def test_what_never_comes_fails_it(manager: FakeManager, scope: Scope, clock: list[float]) -> None:
+    found, _ = soaked(manager, scope, clock, (1e6, 0.1))
     words = "node camera: silent, no image within 3s of its start"
     assert (found, clock[0] < 1006) == (Fault(words, "camera"), True)
 
 
+@pytest.mark.usefixtures("journal")
 @pytest.mark.parametrize(
     ("after", "facts", "fault"),
     [
@@ -108,25 +107,22 @@ def test_what_becomes_of_the_unit_while_it_is_watched(
     assert Gate(manager, scope, options(), lambda _: None)._soak(2 * SECOND) == fault
 
 
-def crash(at: float, boot: str = "b") -> dict[str, str]:
+def crash(at: float, boot: str = "") -> dict[str, object]:
     """A record of journalctl; its CLOCK_REALTIME is that of a clock that was set back."""
-    return {
-        "DORA_EVENT": "node-crashed",
-        "DORA_NODE": "camera",
-        "DORA_EXIT": "exit code 1",
-        "_SYSTEMD_INVOCATION_ID": "1",
-        "_BOOT_ID": boot,
-        "__REALTIME_TIMESTAMP": "5",
-        "__MONOTONIC_TIMESTAMP": str(int(at * SECOND)),
-    }
+    return life_record(
+        *("node-crashed", 5),
+        MESSAGE_ID=EVENTS["node-crashed"].message_id,
+        DORA_NODE="camera",
+        DORA_EXIT="exit code 1",
+        _SYSTEMD_INVOCATION_ID="1",
+        _BOOT_ID=boot or now_boot(),
+        __MONOTONIC_TIMESTAMP=str(int(at * SECOND)),
+    )
 
 
 @pytest.fixture
-def journal(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
-    records: list[dict[str, str]] = []
-    monkeypatch.setattr(JournalReader, "newest", lambda *_: iter(records))
-    monkeypatch.setattr(module, "now_boot", lambda: "b")
-    return records
+def journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeJournal:
+    return FakeJournal(monkeypatch, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -136,24 +132,24 @@ def test_a_clock_that_is_set_back_hides_no_fault(
     manager: FakeManager,
     scope: Scope,
     clock: list[float],
-    journal: list[dict[str, str]],
-    record: dict[str, str],
+    journal: FakeJournal,
+    record: dict[str, object],
     is_fault: bool,
 ) -> None:
     assert clock == [1000]
     manager.add(options(), InvocationID=b"")
-    journal.append(record)
+    journal.write(record)
     fault = Gate(manager, scope, options(), lambda _: None)._fault()
     assert fault == (Fault("node camera: exit code 1", "camera") if is_fault else None)
 
 
 def test_a_crash_ends_the_wait_for_all_nodes(
-    manager: FakeManager, scope: Scope, clock: list[float], journal: list[dict[str, str]]
+    manager: FakeManager, scope: Scope, clock: list[float], journal: FakeJournal
 ) -> None:
     """dora may start a node again and again, without end."""
     unit = manager.add(options(), InvocationID=b"", ActiveState="activating", StatusText="")
     gate = Gate(manager, scope, options(), lambda _: None)
-    journal.append(crash(1000.5))
+    journal.write(crash(1000.5))
     manager.units[unit]["Job"] = (1, "/")
     assert gate._wait_ready(120 * SECOND) == Fault("node camera: exit code 1", "camera")
     assert clock[0] < 1002

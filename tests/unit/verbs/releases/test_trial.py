@@ -1,23 +1,23 @@
 """The files of a trial, and what a reboot at any moment would find."""
 
+import fcntl
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.adapters.bus.manager import Observer
-from dora_systemd.adapters.releases.store import Store, locked
+from dora_systemd.adapters.releases.store import Store, locked, store_root
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.inhibit.guard import IfInhibited
-from dora_systemd.verbs.releases import change as module
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.trial import read_after_wait, read_standing, require_deployable
@@ -43,8 +43,8 @@ def etc(manager: FakeManager) -> Path:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    found = Store(tmp_path / "store", "robot")
+def store(scope: Scope) -> Store:
+    found = Store(store_root(scope.state_root), "robot")
     with locked(found):
         found.release(NEW).mkdir()
     return found
@@ -62,9 +62,9 @@ def try_new(
     manager: FakeManager,
     scope: Scope,
     store: Store,
-    monkeypatch: pytest.MonkeyPatch,
-    fault: Fault | None,
+    fault: Fault | Exception | None,
     tell: Tell = print,
+    how: IfInhibited = IfInhibited.REFUSE,
 ) -> None:
     """Change to the new release, whose gate finds `fault`."""
 
@@ -76,21 +76,20 @@ def try_new(
             standing = read_standing(manager, scope, UNIT)
             assert standing.path.read_text() == text_of(NEW)
             assert standing.trial == NEW
+            if isinstance(fault, Exception):
+                raise fault
             return fault
 
-    monkeypatch.setattr(module, "Gate", FakeGate)
     change = Change(
-        *(NEW, text_of(NEW), release_options(NEW), 0, True, "deploy", IfInhibited.REFUSE),
-        by="doractl deploy",
+        *(NEW, text_of(NEW), release_options(NEW), 0, True, "deploy", how), by="doractl deploy"
     )
-    change_release(manager, scope, store, read_standing(manager, scope, UNIT), change, tell)
+    standing = read_standing(manager, scope, UNIT)
+    change_release(manager, scope, store, standing, change, tell, FakeGate)
 
 
-def test_a_good_release_is_committed(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_good_release_is_committed(manager: FakeManager, scope: Scope, store: Store) -> None:
     deployed(manager)
-    try_new(manager, scope, store, monkeypatch, None)
+    try_new(manager, scope, store, None)
     standing = read_standing(manager, scope, UNIT)
     assert (standing.current, standing.trial) == (NEW, "")
     assert not standing.path.exists()
@@ -98,28 +97,28 @@ def test_a_good_release_is_committed(
 
 
 def test_nothing_that_is_told_stops_the_way_back(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, store: Store
 ) -> None:
     def refuse(_step: object) -> None:
         raise DoraSystemdError("the gateway was stopped")
 
     deployed(manager)
     with pytest.raises(DoraSystemdError, match="rolled back: node a") as caught:
-        try_new(manager, scope, store, monkeypatch, Fault("node a: exit code 1", "a"), refuse)
+        try_new(manager, scope, store, Fault("node a: exit code 1", "a"), refuse)
     assert f"{OLD} runs again" in caught.value.hint
     assert not read_standing(manager, scope, UNIT).path.exists()
-    try_new(manager, scope, store, monkeypatch, None, refuse)
+    try_new(manager, scope, store, None, refuse)
     assert read_standing(manager, scope, UNIT).current == NEW
 
 
 def test_a_thread_of_the_gateway_leaves_the_signals_alone(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, store: Store
 ) -> None:
     deployed(manager)
     before = signal.getsignal(signal.SIGTERM)
     thread = ThreadPoolExecutor(1)
     for fault, told in ((Fault("x"), "x"), (None, "")):
-        done = thread.submit(try_new, manager, scope, store, monkeypatch, fault)
+        done = thread.submit(try_new, manager, scope, store, fault)
         assert told in str(done.exception())
     assert signal.getsignal(signal.SIGTERM) == before
     assert read_standing(manager, scope, UNIT).current == NEW
@@ -127,11 +126,11 @@ def test_a_thread_of_the_gateway_leaves_the_signals_alone(
 
 
 def test_a_bad_release_leaves_the_disk_as_it_was(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, store: Store
 ) -> None:
     deployed(manager)
     with pytest.raises(DoraSystemdError, match="node a: exit code 1") as caught:
-        try_new(manager, scope, store, monkeypatch, Fault("node a: exit code 1", "a"))
+        try_new(manager, scope, store, Fault("node a: exit code 1", "a"))
     assert caught.value.code is ExitCode.ROLLED_BACK
     assert f"{OLD} runs again" in caught.value.hint
     assert etc(manager).read_text() == text_of(OLD)
@@ -145,12 +144,11 @@ def test_what_did_not_run_is_not_started(
     manager: FakeManager,
     scope: Scope,
     store: Store,
-    monkeypatch: pytest.MonkeyPatch,
     active: str,
 ) -> None:
     deployed(manager, active)
     with pytest.raises(DoraSystemdError):
-        try_new(manager, scope, store, monkeypatch, Fault("x"))
+        try_new(manager, scope, store, Fault("x"))
     assert "RestartUnit" not in [call[0] for call in manager.calls]
     assert ("StopUnit", UNIT) in manager.calls
 
@@ -172,18 +170,18 @@ def test_a_trial_ends_before_a_stop_that_may_take_long(
 
     monkeypatch.setattr(manager, "run_jobs", stop)
     with pytest.raises(DoraSystemdError):
-        try_new(manager, scope, store, monkeypatch, Fault("x"), lambda one: told.append(one.text))
+        try_new(manager, scope, store, Fault("x"), lambda one: told.append(one.text))
     assert ("StopUnit", UNIT) in manager.calls
     assert told.count("stopping what runs now") == 1
     assert "stopping what runs now: a left" in told
 
 
 def test_who_stops_a_trial_wants_nothing_to_run(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, store: Store
 ) -> None:
     deployed(manager)
     with pytest.raises(DoraSystemdError):
-        try_new(manager, scope, store, monkeypatch, Fault("it was stopped", is_stop=True))
+        try_new(manager, scope, store, Fault("it was stopped", is_stop=True))
     assert "RestartUnit" not in [call[0] for call in manager.calls]
 
 
@@ -191,41 +189,34 @@ def test_a_commit_that_fails_is_undone(
     manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     deployed(manager)
+    manager.disable_unit_files([UNIT])
 
     def fail(*_: object) -> None:
         raise DoraSystemdError("cannot write it: no space")
 
-    monkeypatch.setattr(module, "commit", fail)
+    monkeypatch.setattr(manager, "enable_unit_files", fail)
     with pytest.raises(DoraSystemdError, match="no space") as caught:
-        try_new(manager, scope, store, monkeypatch, None)
+        try_new(manager, scope, store, None)
     assert caught.value.code is ExitCode.ROLLED_BACK
     assert read_standing(manager, scope, UNIT).current == OLD
     assert [one.is_proved for one in store.known()] == [False], "a rollback would take it"
     store.prove(NEW)
     with pytest.raises(DoraSystemdError, match="no space"):
-        try_new(manager, scope, store, monkeypatch, None)
+        try_new(manager, scope, store, None)
     assert [one.is_proved for one in store.known()] == [True], "it has passed another trial"
 
 
-def test_a_terminal_that_is_gone(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_terminal_that_is_gone(manager: FakeManager, scope: Scope, store: Store) -> None:
     deployed(manager)
-
-    def fail(*_: object) -> None:
-        raise OSError(5, "Input/output error")
-
-    monkeypatch.setattr(module, "commit", fail)
+    gone = OSError(5, "Input/output error")
     with pytest.raises(DoraSystemdError, match="Input/output error") as caught:
-        try_new(manager, scope, store, monkeypatch, None)
+        try_new(manager, scope, store, gone)
     assert caught.value.code is ExitCode.ROLLED_BACK
     assert not read_standing(manager, scope, UNIT).path.exists()
 
 
-def test_a_first_release_is_enabled(
-    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    try_new(manager, scope, store, monkeypatch, None)
+def test_a_first_release_is_enabled(manager: FakeManager, scope: Scope, store: Store) -> None:
+    try_new(manager, scope, store, None)
     assert read_standing(manager, scope, UNIT).boot.is_enabled
 
 
@@ -247,7 +238,7 @@ def test_what_start_has_started_and_has_ended_is_unloaded_before_the_trial(
         reset_failed(unit)
 
     monkeypatch.setattr(manager, "reset_failed", reset)
-    try_new(manager, scope, store, monkeypatch, None)
+    try_new(manager, scope, store, None)
     assert ("reset", UNIT) in manager.calls
     assert read_standing(manager, scope, UNIT).current == NEW
 
@@ -264,20 +255,22 @@ def test_what_is_stopped_during_a_wait_is_not_started_again(
     manager: FakeManager,
     scope: Scope,
     store: Store,
-    monkeypatch: pytest.MonkeyPatch,
     now: dict[str, str],
     reason: str,
 ) -> None:
     deployed(manager)
+    lock = scope.cell_directory("robot") / "inhibit.lock"
+    lock.parent.mkdir(parents=True)
+    make_lock(lock)
+    with lock.open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
 
-    @contextmanager
-    def wait(*_: object) -> Iterator[None]:
-        manager.units[UNIT] |= now
-        yield
+        def stop(_step: object) -> None:
+            manager.units[UNIT] |= now
+            fcntl.flock(file, fcntl.LOCK_UN)
 
-    monkeypatch.setattr(module, "uninhibited", wait)
-    with pytest.raises(DoraSystemdError, match=f"cannot deploy robot: {reason}") as caught:
-        try_new(manager, scope, store, monkeypatch, None)
+        with pytest.raises(DoraSystemdError, match=f"cannot deploy robot: {reason}") as caught:
+            try_new(manager, scope, store, None, stop, IfInhibited.WAIT)
     assert caught.value.code is ExitCode.NOT_RUNNING
     assert "RestartUnit" not in [call[0] for call in manager.calls]
     assert read_standing(manager, scope, UNIT).current == OLD
