@@ -37,7 +37,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope
 from dora_systemd.trust.paths import exists
-from dora_systemd.trust.socket_table import listening_sockets
+from dora_systemd.trust.socket_table import TABLES, listening_sockets
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.gateway import read_gateway
@@ -45,15 +45,17 @@ from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.account import DEFAULT_USER
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.linger import is_lingering, linger_command
-from dora_systemd.verbs.start.logins import judge_logins
+from dora_systemd.verbs.start.logins import PASSWD, judge_logins
 from dora_systemd.verbs.start.settings import check_config, config_files
 
 _SECONDS = 20.0
 _BROKEN = ("bad-setting", "error")
 
 
-def examine(reach: Callable[[Scope], Manager], scope: Scope) -> list[Finding]:
-    """All findings. reach: opens the connection to systemd."""
+def examine(
+    reach: Callable[[Scope], Manager], scope: Scope, root: Path = Path("/")
+) -> list[Finding]:
+    """All findings. reach: opens the connection to systemd. root: has all files of the machine."""
     try:
         manager = reach(scope)
         version = manager.version()
@@ -61,32 +63,35 @@ def examine(reach: Callable[[Scope], Manager], scope: Scope) -> list[Finding]:
         found = [Finding("systemd", State.PROBLEM, error.message, error.hint)]
     else:
         found = [judge_systemd(version)]
-        found += [one for check in _WITH_SYSTEMD for one in _guarded(check, manager, scope)]
-    return found + [one for check in _WITHOUT for one in check(scope)]
+        found += [one for check in _WITH_SYSTEMD for one in guarded(check, manager, scope, root)]
+    return found + [one for check in _WITHOUT for one in check(scope, root)]
 
 
-def _guarded(
-    check: Callable[[Manager, Scope], Iterator[Finding]], manager: Manager, scope: Scope
+def guarded(
+    check: Callable[[Manager, Scope, Path], Iterator[Finding]],
+    manager: Manager,
+    scope: Scope,
+    root: Path,
 ) -> list[Finding]:
     """The findings of a check; its failure is one more."""
     topic = check.__name__.removeprefix("_").removeprefix("judge_")
     found: list[Finding] = []
     try:
-        for one in check(manager, scope):
+        for one in check(manager, scope, root):
             found.append(one)
     except DoraSystemdError as error:
         found.append(Finding(topic, State.WARNING, error.message, error.hint))
     return found
 
 
-def _controllers(manager: Manager, scope: Scope) -> Iterator[Finding]:
+def _controllers(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
     group = cgroup.group_path(manager.control_group())
     available = cgroup.read_controllers(group)
     yield judge_controllers(available, scope.is_user)
     yield judge_cpuset(available, scope.is_user)
 
 
-def _linger(_manager: Manager, scope: Scope) -> Iterator[Finding]:
+def _linger(_manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
     if not scope.is_user:
         return
     if is_lingering(scope):
@@ -96,7 +101,7 @@ def _linger(_manager: Manager, scope: Scope) -> Iterator[Finding]:
         yield Finding("linger", State.WARNING, text, f"as root: {linger_command(scope)}")
 
 
-def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
+def _boot(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
     if boot_target(manager, scope) == BOOT_TARGET:
         yield Finding("boot", State.OK, f"{BOOT_TARGET} starts what is enabled")
     else:
@@ -112,20 +117,20 @@ def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
             yield Finding("boot", State.WARNING, text, f"systemctl {scope.flag} daemon-reload")
 
 
-def _ports(manager: Manager, _scope: Scope) -> Iterator[Finding]:
+def _ports(manager: Manager, _scope: Scope, root: Path) -> Iterator[Finding]:
     gateway = read_gateway(manager)
     processes: list[Process] = []
     for port in DORA_PORTS:
         if gateway.is_up and gateway.port == port:
             yield Finding(f"port {port}", State.OK, "the gateway to all dataflows, see doractl env")
             continue
-        sockets = listening_sockets(port)
-        owners = socket_owners(sockets) if sockets else frozenset()
-        processes = processes or (read_processes() if owners else [])
+        sockets = listening_sockets(port, tuple(_below(root, one) for one in TABLES))
+        owners = socket_owners(sockets, root / "proc") if sockets else frozenset()
+        processes = processes or (read_processes(root / "proc") if owners else [])
         yield judge_port(port, [one for one in processes if one.pid in owners], bool(sockets))
 
 
-def _units(manager: Manager, scope: Scope) -> Iterator[Finding]:
+def _units(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
     for one in manager.list_units("dora-*.service"):
         if one.load in _BROKEN:
             text = f"{one.unit} cannot be loaded: {one.load}"
@@ -150,7 +155,7 @@ def _enabled(path: Path, scope: Scope) -> Iterator[Finding]:
         yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
 
 
-def _leftovers(manager: Manager, scope: Scope) -> Iterator[Finding]:
+def _leftovers(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
     left = [path for path in _cell_directories(scope) if _is_down(manager, unit_name(path.name))]
     for path in left:
         text = f"{path} belongs to no dataflow that runs"
@@ -179,7 +184,7 @@ def _is_down(manager: Manager, unit: str) -> bool:
     return manager.read(unit, ["ActiveState"])["ActiveState"] in DOWN
 
 
-def _journal(scope: Scope) -> Iterator[Finding]:
+def _journal(scope: Scope, _root: Path) -> Iterator[Finding]:
     try:
         journal_reader.check_readable(scope)
     except DoraSystemdError as error:
@@ -199,7 +204,7 @@ def _journal(scope: Scope) -> Iterator[Finding]:
         yield judge_rate(config, scope.is_user)
 
 
-def _dora(_scope: Scope) -> Iterator[Finding]:
+def _dora(_scope: Scope, _root: Path) -> Iterator[Finding]:
     path = os.environ.get("PATH", os.defpath)
     try:
         dora = find_dora(None, os.environ.get("VIRTUAL_ENV"), path)
@@ -214,7 +219,7 @@ def _dora(_scope: Scope) -> Iterator[Finding]:
         yield Finding("dora", State.OK, f"{dora}, version {version}")
 
 
-def _user(scope: Scope) -> Iterator[Finding]:
+def _user(scope: Scope, _root: Path) -> Iterator[Finding]:
     if scope.is_user:
         return
     try:
@@ -226,9 +231,9 @@ def _user(scope: Scope) -> Iterator[Finding]:
         yield Finding("user", State.OK, f"{DEFAULT_USER} runs the dataflows of root's files")
 
 
-def _settings(scope: Scope) -> Iterator[Finding]:
+def _settings(scope: Scope, root: Path) -> Iterator[Finding]:
     """Check the settings files for all dataflows; `start` checks the one beside a dataflow."""
-    for path in config_files(os.environ):
+    for path in (_below(root, one) for one in config_files(os.environ)):
         if exists(path):
             try:
                 check_config(scope, path)
@@ -238,13 +243,25 @@ def _settings(scope: Scope) -> Iterator[Finding]:
                 yield Finding("settings", State.OK, f"{path} can be read")
 
 
-def _processes(_scope: Scope) -> Iterator[Finding]:
-    yield from judge_processes(read_processes())
+def _processes(_scope: Scope, root: Path) -> Iterator[Finding]:
+    yield from judge_processes(read_processes(root / "proc"))
 
 
-def _real_time(_scope: Scope) -> Iterator[Finding]:
-    yield from judge_real_time(read_real_time())
+def _real_time(_scope: Scope, root: Path) -> Iterator[Finding]:
+    yield from judge_real_time(read_real_time(root))
 
 
-_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports, judge_releases)
-_WITHOUT = (_journal, _dora, _user, judge_logins, _settings, _processes, _real_time)
+def _releases(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
+    return judge_releases(manager, scope)
+
+
+def _logins(scope: Scope, root: Path) -> Iterator[Finding]:
+    return judge_logins(scope, _below(root, PASSWD))
+
+
+def _below(root: Path, path: Path) -> Path:
+    return root / path.relative_to("/")
+
+
+_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports, _releases)
+_WITHOUT = (_journal, _dora, _user, _logins, _settings, _processes, _real_time)

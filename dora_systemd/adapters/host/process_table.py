@@ -23,9 +23,9 @@ def read_processes(proc: Path = PROC) -> list[Process]:
     return sorted((one for one in found if one), key=lambda one: one.pid)
 
 
-def socket_owners(inodes: Collection[int]) -> frozenset[int]:
+def socket_owners(inodes: Collection[int], proc: Path = PROC) -> frozenset[int]:
     """The processes that hold one of these sockets."""
-    paths = PROC.glob("[0-9]*/fd")
+    paths = proc.glob("[0-9]*/fd")
     return frozenset(int(path.parent.name) for path in paths if _holds(path, inodes))
 
 

@@ -7,7 +7,7 @@ has been told is in memory only.
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -51,20 +51,30 @@ if TYPE_CHECKING:
 _LONGEST = 100
 
 
+async def _connection_of(boot: MemberBoot) -> Ends:
+    return await taken_over(boot.connection, boot.rest, wire.MAX_LINE)
+
+
 class Member(Shared):
     """A machine that another one has given nodes.
 
     stops_by_head: the head knows that this part ends. is_answered: the head ends its own part, or
-    is gone. grace: µs that the head leaves the nodes.
+    is gone. grace: µs that the head leaves the nodes. take_over: gives the connection to the head.
     """
 
-    def __init__(self, options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> None:
+    def __init__(
+        self,
+        options: RunnerOptions,
+        this_life: Life,
+        boot: EarlyDaemon | None,
+        take_over: Callable[[MemberBoot], Awaitable[Ends]] = _connection_of,
+    ) -> None:
         # The head decides which failure ends the dataflow: its members only report them.
         rights = without_essential(options.node_rights)
         super().__init__(options._replace(owes=(), node_rights=rights), this_life)
         if not isinstance(boot, MemberBoot):
             raise no_head()
-        self._boot = boot
+        self._boot, self._take_over = boot, take_over
         self._lines: Lines | None = None
         self._dora: MemberEngine | None = None
         self._pump: Pump | None = None
@@ -145,8 +155,7 @@ class Member(Shared):
             self._lines.send(message)
 
     async def _hear_head(self) -> None:
-        boot = self._boot
-        await self.talk(await taken_over(boot.connection, boot.rest, wire.MAX_LINE))
+        await self.talk(await self._take_over(self._boot))
 
     async def talk(self, ends: Ends) -> None:
         """Do what the head says until it is gone."""

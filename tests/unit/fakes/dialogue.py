@@ -35,7 +35,8 @@ class Bench:
 
     def __init__(self, root: Path, state: State = State.RUNNING) -> None:
         self.calls: Calls = []
-        self.nodes, self.pipes = FakeNodes(self.calls), FakePipes(self.calls)
+        self.pipes = FakePipes(self.calls)
+        self.nodes = FakeNodes(root, self.pipes, self.calls)
         self.dora = FakeDora(self.calls)
         cell = Cell(2 * SECOND, 0, {"a": NodeStatus("running", 7)}, state, run="run")
         self.pump = Heard(cell, Life("uuid"), CellPaths(root), self.nodes, self.pipes)

@@ -30,7 +30,8 @@ class ReloadBench:
     def __init__(self, root: Path, state: State = State.RUNNING, **nodes: NodeStatus) -> None:
         self.root = root
         self.calls: Calls = []
-        self.nodes, self.pipes = FakeNodes(self.calls), FakePipes(self.calls)
+        self.pipes = FakePipes(self.calls)
+        self.nodes = FakeNodes(root, self.pipes, self.calls)
         self.dora = FakeDora(self.calls)
         table = {"a": RUNNING, "b": RUNNING, **nodes}
         cell = Cell(2 * SECOND, 0, table, state, run="run", ready_us=1)

@@ -17,24 +17,40 @@ from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.dora.protocol import LogRecord, Params, Reply
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.logs.fields import Value
+from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.engine import Engine
-from dora_systemd.runner.nodes.gate import Gates
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.resources import Resources
-from dora_systemd.runner.signs.none import NoSigns
 
 Calls = list[tuple[Any, ...]]
 """What the fakes of one run were asked to do, in its order."""
 
 
+class NoJournal:
+    """A journald that takes nothing."""
+
+    def send(self, entry: bytes) -> bool:
+        del entry
+        return False
+
+    send_bulk = send
+
+    def call_when_ready(self, _: asyncio.AbstractEventLoop, __: Callable[[], None]) -> None:
+        """It never is."""
+
+    def wait_ready(self, seconds: float) -> None:
+        """It never is."""
+
+
 class FakeResources(Resources):
     """Limits that come close when `records` says so."""
 
-    def __init__(self) -> None:
+    def __init__(self, unit: Path) -> None:
+        super().__init__(unit)
         self.records: list[Record] = []
 
     def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> list[Record]:
@@ -43,13 +59,15 @@ class FakeResources(Resources):
 
 
 class FakeNodes(Nodes):
-    """living: nodes and processes that are there. ooms: by node, and by "" for dora."""
+    """The nodes of a unit whose cgroup and directory are both `root`.
 
-    def __init__(self, calls: Calls | None = None) -> None:
+    living: nodes and processes that are there. ooms: by node, and by "" for dora.
+    """
+
+    def __init__(self, root: Path, pipes: LogPipes, calls: Calls | None = None) -> None:
+        super().__init__(root, CellPaths(root), pipes)
         self.calls: Calls = [] if calls is None else calls
-        self.resources: FakeResources = FakeResources()
-        self.signs = NoSigns()
-        self.gates = Gates(CellPaths(Path("/nowhere")))
+        self.resources: FakeResources = FakeResources(root)
         self.living: set[tuple[str, int]] = set()
         self.ooms: dict[str, Oom] = {}
         self.bare: set[str] = set()
@@ -121,6 +139,7 @@ class FakePipes(LogPipes):
     """events: what was written. broken: life events that cannot be."""
 
     def __init__(self, calls: Calls | None = None) -> None:
+        super().__init__(asyncio.get_running_loop(), NoJournal(), Origin("robot", "uuid"))
         self.calls: Calls = [] if calls is None else calls
         self.events: list[tuple[str, str | None, dict[str, Value]]] = []
         self.broken: set[str] = set()
@@ -157,6 +176,7 @@ class FakeDora(Engine):
     """
 
     def __init__(self, calls: Calls | None = None) -> None:
+        super().__init__("/bin/dora", CellPaths(Path("/nowhere")), {})
         self.calls: Calls = [] if calls is None else calls
         self.asked: list[Params] = []
         self.answers: defaultdict[str, deque[Any]] = defaultdict(deque)

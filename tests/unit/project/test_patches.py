@@ -11,7 +11,7 @@ import pytest
 
 from tests.unit.checkout import CHECKOUT
 
-MAX = 62
+MAX = 31
 """Each one left is a door to the outside for which a parameter would be worse to read."""
 
 OURS = ("dora_systemd", "tests")

@@ -1,6 +1,7 @@
 """doctor against a fake systemd, and without any."""
 
 import os
+import pwd
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -8,50 +9,48 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.host.process import Completed
-from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.decisions.views.findings import Finding, State
-from dora_systemd.decisions.views.real_time import RealTime
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs import doctor
-from dora_systemd.verbs.doctor import examine
-from dora_systemd.verbs.start import logins
+from dora_systemd.verbs.doctor import examine, guarded
+from tests.unit.fakes.cgroups import fake_cgroups
+from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.fakes.programs import make_dora, make_program
 from tests.unit.verbs.start.test_claim import make_plan, place
 
 
 @pytest.fixture
 def manager(manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeManager:
-    """A machine where all is well."""
+    """A machine where all is well. Its files are below tmp_path."""
     manager.units["dora.target"] = {"LoadState": "loaded", "WantedBy": ["multi-user.target"]}
-    (tmp_path / "cgroup").mkdir()
-    (tmp_path / "cgroup/cgroup.controllers").write_text("cpu cpuset io memory pids\n")
-    monkeypatch.setattr(cgroup, "mount_point", lambda: tmp_path / "cgroup")
-    monkeypatch.setattr(journal_reader, "check_readable", lambda _scope: None)
-    monkeypatch.setattr(journal_reader, "is_volatile", lambda: False)
-    monkeypatch.setattr(doctor, "run_command", lambda *_: Completed(0, "", ""))
-    monkeypatch.setattr(doctor, "find_dora", lambda *_: "/bin/dora")
-    monkeypatch.setattr(doctor, "dora_version", lambda _dora: "1.1.0")
-    monkeypatch.setattr(doctor, "DEFAULT_USER", "root")
-    monkeypatch.setattr(doctor, "config_files", lambda _: [])
-    monkeypatch.setattr(doctor, "read_processes", list)
-    monkeypatch.setattr(doctor, "read_real_time", RealTime)
-    monkeypatch.setattr(logins, "_logins", lambda _passwd: [])
-    monkeypatch.setattr(doctor, "listening_sockets", lambda _port: frozenset())
+    mount = fake_cgroups(monkeypatch, tmp_path)
+    (mount / "cgroup.controllers").write_text("cpu cpuset io memory pids\n")
+    FakeJournal(monkeypatch, tmp_path)
+    make_dora(tmp_path / "bin/dora", "1.1.0")
+    make_program(tmp_path / "bin/systemd-analyze")
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
+    monkeypatch.setenv("XDG_CONFIG_HOME", "/config")
+    monkeypatch.delenv("VIRTUAL_ENV", raising=False)
+    monkeypatch.setattr(pwd, "getpwnam", lambda _name: pwd.getpwuid(0))
     return manager
+
+
+def look(manager: FakeManager, scope: Scope) -> list[Finding]:
+    """The findings; the directory of the runtime directories has all files of the machine."""
+    assert isinstance(scope, ScopeIn)
+    return examine(lambda _scope: manager, scope, scope.root.parent)
 
 
 def found(manager: FakeManager, scope: Scope) -> dict[str, Finding]:
     """The last finding of each topic that is not as it should be."""
-    findings = examine(lambda _scope: manager, scope)
+    findings = look(manager, scope)
     return {one.topic: one for one in findings if one.state is not State.OK}
 
 
 def test_all_is_well(manager: FakeManager, scope: Scope) -> None:
-    findings = examine(lambda _scope: manager, scope)
+    findings = look(manager, scope)
     assert {one.state for one in findings} == {State.OK}
     assert {one.topic for one in findings} == {
         *("systemd", "cgroup", "boot", "left over", "journal", "log rate", "dora", "user"),
@@ -60,11 +59,10 @@ def test_all_is_well(manager: FakeManager, scope: Scope) -> None:
     assert not any(one.remedy for one in findings)
 
 
-def test_its_own_gateway_is_no_stranger(
-    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(doctor, "listening_sockets", lambda _port: frozenset({7}))
-    monkeypatch.setattr(doctor, "socket_owners", lambda _sockets: frozenset())
+def test_its_own_gateway_is_no_stranger(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
+    line = "0: 0100007F:{:04X} 00000000:0000 0A 00000000:00000000 00:00000000 00000000 0 0 7 1 0\n"
+    (tmp_path / "proc/net").mkdir(parents=True)
+    (tmp_path / "proc/net/tcp").write_text("".join(line.format(port) for port in (6013, 53290)))
     assert {"port 6013", "port 53290"} <= found(manager, scope).keys()
     facts = {"LoadState": "loaded", "ActiveState": "active"}
     manager.units[SOCKET_UNIT] = {**facts, "Listen": [["Stream", "127.0.0.1:53290"]]}
@@ -89,7 +87,7 @@ def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_
         group = tmp_path / f"cgroup/dora.slice/dora-{name}.service"
         group.mkdir(parents=True)
         (group / "cgroup.events").write_text("populated 1\n")
-    findings = examine(lambda _scope: manager, scope)
+    findings = look(manager, scope)
     left = [one for one in findings if one.topic == "left over"]
     assert [one.state for one in left] == [State.WARNING] * 2
     assert left[0].remedy == f"rm -r {scope.cell_directory('ghost')}"
@@ -132,12 +130,16 @@ def test_an_enabled_unit_that_starts_nothing(
         assert finding.remedy == "systemctl --system disable dora-robot.service"
 
 
-def test_a_half_written_settings_file(
-    manager: FakeManager, scope: Scope, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "config.yml"
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "config/dora-systemd/config.yml"
+    path.parent.mkdir(parents=True)
+    return path
+
+
+def test_a_half_written_settings_file(manager: FakeManager, scope: Scope, config: Path) -> None:
+    path = config
     path.write_text("env: {A: 1\n")
-    monkeypatch.setattr(doctor, "config_files", lambda _: [path])
     finding = found(manager, scope)["settings"]
     assert finding.state is State.PROBLEM
     assert finding.text.startswith(f"cannot read {path}: line ")
@@ -151,12 +153,10 @@ def test_a_half_written_settings_file(
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs a file of somebody else")
 def test_a_settings_file_that_root_would_not_believe(
-    manager: FakeManager, scope: Scope, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, config: Path
 ) -> None:
-    path = tmp_path / "config.yml"
-    monkeypatch.setattr(doctor, "config_files", lambda _: [path])
-    path.write_text("user: root\n")
-    os.chown(path, 1, 1)
+    config.write_text("user: root\n")
+    os.chown(config, 1, 1)
     assert "the file is not root's" in found(manager, scope)["settings"].text
 
 
@@ -166,44 +166,42 @@ def test_a_broken_unit(manager: FakeManager, scope: Scope) -> None:
     assert finding.text == "dora-robot.service cannot be loaded: bad-setting"
 
 
-def test_dora(manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "dora_version", lambda _dora: "1.0.1")
+def test_dora(
+    manager: FakeManager, scope: Scope, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_dora(tmp_path / "bin/dora", "1.0.1")
     assert found(manager, scope)["dora"].state is State.NOTE
-
-    def fail(*_: object) -> str:
-        raise DoraSystemdError("cannot find the dora command", "install it", ExitCode.NO_DORA)
-
-    monkeypatch.setattr(doctor, "find_dora", fail)
+    (tmp_path / "bin/dora").unlink()
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:{tmp_path}/journal")
     assert found(manager, scope)["dora"].state is State.PROBLEM
 
 
-def test_linger(manager: FakeManager, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    user = ScopeIn(is_user=True, uid=0, root=tmp_path)
-    monkeypatch.setattr(doctor, "is_lingering", lambda _scope: False)
+def test_linger(manager: FakeManager, tmp_path: Path) -> None:
+    user = ScopeIn(is_user=True, uid=0, root=tmp_path / "run")
+    make_program(tmp_path / "bin/loginctl", "echo no")
     finding = found(manager, user)["linger"]
     assert finding.remedy == "as root: loginctl enable-linger root"
-    monkeypatch.setattr(doctor, "is_lingering", lambda _scope: True)
+    make_program(tmp_path / "bin/loginctl", "echo yes")
     assert "linger" not in found(manager, user)
 
 
 def test_a_check_that_fails_is_a_finding(
     manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail() -> Path:
+    def fail() -> str:
         raise DoraSystemdError("cannot find the cgroup v2 hierarchy", "", ExitCode.NO_SYSTEMD)
 
-    monkeypatch.setattr(cgroup, "mount_point", fail)
+    monkeypatch.setattr(manager, "control_group", fail)
     assert "cannot find the cgroup v2" in found(manager, scope)["controllers"].text
 
 
 def test_what_a_check_has_found_before_it_fails_is_told(
-    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, tmp_path: Path
 ) -> None:
     def judge_doors(*_: object) -> Iterator[Finding]:
         yield Finding("front", State.WARNING, "it is open")
         raise DoraSystemdError("cannot look at the other door")
 
-    monkeypatch.setattr(doctor, "_WITH_SYSTEMD", (judge_doors,))
-    told = found(manager, scope)
+    told = {one.topic: one for one in guarded(judge_doors, manager, scope, tmp_path)}
     assert told["front"].text == "it is open"
     assert told["doors"].text == "cannot look at the other door"

@@ -35,7 +35,8 @@ class Bench:
     ) -> None:
         self.calls: Calls = []
         self.this_life = this_life or Life("uuid")
-        self.nodes, self.pipes = FakeNodes(self.calls), FakePipes(self.calls)
+        self.pipes = FakePipes(self.calls)
+        self.nodes = FakeNodes(root, self.pipes, self.calls)
         self.paths = CellPaths(root)
         cell = Cell(2 * SECOND, 0, RUNS, state, **{"run": "run", "ready_us": 1, **changes})
         self.pump = Pump(cell, self.this_life, self.paths, self.nodes, self.pipes)

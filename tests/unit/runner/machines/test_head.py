@@ -56,7 +56,9 @@ class FakeHead(FakeDora):
 
 class Bench:
     def __init__(self, root: Path, is_awaited: bool = True, **options: Any) -> None:
-        self.nodes, self.pipes = FakeNodes(), FakePipes()
+        self.pipes = FakePipes()
+        self.nodes = FakeNodes(root, self.pipes)
+        (root / "io").mkdir()
         self.dora = FakeHead()
         self.dora.daemons = ["", "gpu"]
         given = OPTIONS._replace(**options)
@@ -68,12 +70,12 @@ class Bench:
         self.dialogue = HeadDialogue(given, self.pump, self.dora, self.nodes, self.pipes)
         self.roster.is_awaited = is_awaited
         self.dialogue.begin(self.roster, cast(HeadEngine, self.dora))
-        self.ended = 0
-        self.dialogue._end_nodes = self._end_nodes  # type: ignore[method-assign]
         self.actions = self.dialogue.actions({"nodes": []}, {})
 
-    async def _end_nodes(self) -> None:
-        self.ended += 1
+    @property
+    def ended(self) -> int:
+        """How often its nodes were ended without dora."""
+        return self.nodes.calls.count(("kill",))
 
     async def link(self, *said: wire.Message) -> FakeEnds:
         other = FakeEnds()

@@ -1,6 +1,7 @@
 """A member: what it says to the head, and what it does without one."""
 
 import asyncio
+import subprocess
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -21,7 +23,6 @@ from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.life import Life
-from dora_systemd.runner.machines import member_dialogue
 from dora_systemd.runner.machines.engine import MemberEngine
 from dora_systemd.runner.machines.member import Member
 from dora_systemd.runner.machines.member_boot import MemberBoot
@@ -51,34 +52,54 @@ class FakeBoot(MemberBoot):
         self.part = PART
 
 
+class FakeEngine(MemberEngine):
+    """is_cut_off: its daemon was killed."""
+
+    is_cut_off = False
+
+    def cut_off(self) -> None:
+        self.is_cut_off = True
+
+
 class Bench:
     def __init__(self, root: Path, state: State) -> None:
         paths = CellPaths(root)
         self.boot = FakeBoot()
-        self.member = Member(OPTIONS, Life("uuid"), self.boot)
-        self.member._hear_head = settle  # type: ignore[method-assign]
+        self.comes = asyncio.get_running_loop().create_future()
+        self.member = Member(OPTIONS, Life("uuid"), self.boot, self.take_over)
         self.member._version = "1.1.4"
-        self.nodes, self.pipes = FakeNodes(), FakePipes()
+        self.pipes = FakePipes()
+        self.nodes = FakeNodes(root, self.pipes)
+        (root / "io").mkdir()
         cell = Cell(2 * SECOND, 0, {"mid": NodeStatus("running", 7)}, state, run="run")
         self.pump = Heard(self.member.cell(cell), Life("uuid"), paths, self.nodes, self.pipes)
         self.pump.heard, self.pump.calls = [], []
-        dora = self.member.engine("/bin/dora", paths, {}, None)
+        self.member.engine("/bin/dora", paths, {}, None)
+        dora = FakeEngine("/bin/dora", paths, {}, (), OPTIONS.machine)
         dialogue = self.member.dialogue(OPTIONS, self.pump, dora, self.nodes, self.pipes)
         assert isinstance(dialogue, MemberDialogue)
-        assert isinstance(dora, MemberEngine)
         self.dialogue, self.dora = dialogue, dora
         self.actions = dialogue.actions({"nodes": []}, {})
 
     def be(self, **changes: Any) -> None:
         self.pump.cell = replace(self.pump.cell, **changes)
 
+    async def take_over(self, _boot: object) -> Ends:
+        ends: Ends = await self.comes
+        return ends
+
     async def head(self, part: wire.Part = PART) -> FakeEnds:
         """A head that has sent its part."""
         other = FakeEnds()
         self.boot.part = part
-        self.talk = asyncio.create_task(self.member.talk(other.ends))
+        self.comes.set_result(other.ends)
         await settle()
         return other
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether its nodes were ended without dora."""
+        return ("kill",) in self.nodes.calls
 
     def heard(self) -> list[life.Event]:
         return [replace(one, at_us=0) for one in self.pump.heard]
@@ -149,27 +170,29 @@ def test_what_the_head_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("said", "seconds"), [(SECOND // 2, 0.5), (0, 0.0), (3600 * SECOND, 2.0)])
-def test_the_head_can_only_shorten_the_grace(
-    said: int, seconds: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_head_can_only_shorten_the_grace(said: int, seconds: float, tmp_path: Path) -> None:
     """Its nodes end with those here, and its grace duration began before."""
 
     async def work(bench: Bench) -> None:
-        given: list[float] = []
-
-        async def end_nodes(_nodes: object, _own: object, seconds: float) -> None:
-            given.append(seconds)
-
-        monkeypatch.setattr(member_dialogue, "end_nodes", end_nodes)
-        bench.dora.cut_off = lambda: None  # type: ignore[method-assign]
         other = await bench.head()
         other.say(wire.StopPart(said))
         await settle()
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
         bench.actions[Do.END_NODES]()
-        await settle()
-        assert given == [seconds]
+        while not bench.has_ended:
+            await asyncio.sleep(0.01)
+        assert loop.time() - begun == pytest.approx(seconds, abs=0.11)
 
-    run(tmp_path, work, State.STOPPING)
+    command = ["sh", "-c", "trap '' TERM; echo; exec sleep 60"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as stubborn:
+        assert stubborn.stdout
+        stubborn.stdout.readline()
+        group = tmp_path / "node-mid"
+        group.mkdir()
+        (group / "cgroup.procs").write_text(f"{stubborn.pid}\n")
+        run(tmp_path, work, State.STOPPING)
+        stubborn.kill()
 
 
 @pytest.mark.parametrize(
@@ -185,7 +208,6 @@ def test_who_stops_it_here_is_told_but_a_shutdown_is_nobody(
     async def work(bench: Bench) -> None:
         other = await bench.head()
         bench.member.is_going_down = lambda _: is_down
-        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
         bench.be(stop_by="SIGTERM")
         bench.actions[Do.EXIT]()
         assert other.heard() == [{"type": "ended", **ended, "failed": 0}]
@@ -208,50 +230,34 @@ def threads(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         other = await bench.head()
-        asked: list[Thread | None] = []
+        asked: list[Thread] = []
 
         def is_going_down(is_of_user: bool) -> bool:
             asked.append(current_thread())
             return is_of_user
 
-        async def end_nodes() -> None:
-            assert other.heard() == [{"type": "ended", "reason": "", "by": "SIGTERM", "failed": 0}]
-            asked.append(None)
-
         bench.member.is_going_down = is_going_down
-        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
-        bench.dialogue._end_nodes = end_nodes  # type: ignore[method-assign]
         bench.be(stop_by="SIGTERM")
         stop = asyncio.create_task(bench.dialogue._stop())
         await settle()
-        assert len(asked) == 1, "the head has not answered yet"
+        assert other.heard() == [{"type": "ended", "reason": "", "by": "SIGTERM", "failed": 0}]
+        assert not bench.has_ended, "the head has not answered yet"
         other.say(wire.StopPart(SECOND))
         await stop
-        thread, last = asked
-        assert thread is not current_thread() and last is None
+        (thread,) = asked
+        assert thread is not current_thread() and bench.has_ended
 
     run(tmp_path, work)
 
 
 @pytest.mark.usefixtures("threads")
-def test_a_head_that_does_not_answer_holds_up_no_stop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_head_that_does_not_answer_holds_up_no_stop(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         await bench.head()
-        ended: list[None] = []
-
-        async def end_nodes() -> None:
-            ended.append(None)
-
         bench.member.is_going_down = lambda _: False
-        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
-        bench.dialogue._end_nodes = end_nodes  # type: ignore[method-assign]
         bench.be(stop_by="SIGTERM")
         await bench.dialogue._stop()
-        assert ended == [None]
-
-    monkeypatch.setattr(member_dialogue, "_ANSWER_SECONDS", 0.01)
+        assert bench.has_ended
 
     run(tmp_path, work)
 
@@ -285,7 +291,6 @@ def test_a_table_is_sent_when_it_is_new(tmp_path: Path) -> None:
         group.mkdir()
         (group / "memory.current").write_text("4096\n")
         (tmp_path / "node-stranger").mkdir()
-        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
         other = await bench.head()
         table = CellStatus(uuid=UUID, nodes={"mid": NodeStatus("running", 7)})
         assert bench.pump.amend(bench.pump.amend(table)) == table, "here the cgroup tells it"
@@ -303,13 +308,9 @@ def test_the_first_processes_are_those_that_the_launchers_note(tmp_path: Path) -
     async def work() -> None:
         bench = Bench(tmp_path, State.WAITING)
         bench.be(nodes={"mid": NodeStatus("starting"), "late": NodeStatus("running", 8)})
-        noted = iter((0, 77))
-
-        def noted_pid(_node: str) -> int:
-            return next(noted)
-
-        bench.nodes.noted_pid = noted_pid  # type: ignore[method-assign, assignment]
         found = asyncio.ensure_future(find(bench.pump, bench.nodes))
+        await settle()
+        CellPaths(tmp_path).node_pid("mid").write_text("77")
         while not bench.pump.heard:
             await asyncio.sleep(0.01)
         (event,) = bench.pump.heard
@@ -325,11 +326,8 @@ def test_a_daemon_without_a_head_is_killed(tmp_path: Path) -> None:
     """It would look for a coordinator where any user can listen now; nodes have their time."""
 
     async def work(bench: Bench) -> None:
-        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
-        killed: list[str] = []
-        bench.dora.cut_off = lambda: killed.append("daemon")  # type: ignore[method-assign]
         bench.actions[Do.END_NODES]()
-        assert killed == ["daemon"]
+        assert bench.dora.is_cut_off
         bench.dialogue._child_exited("daemon", exit_of(-9))
         await settle()
         assert not [one for one in bench.heard() if isinstance(one, life.ChildExited)]

@@ -20,7 +20,7 @@ from dora_systemd.runner.reload.swap import Swapper
 from dora_systemd.values import SECOND
 from tests.unit.fakes.loop import live
 from tests.unit.fakes.reload import ReloadBench
-from tests.unit.fakes.run import Calls, FakeNodes
+from tests.unit.fakes.run import Calls, FakeNodes, FakePipes
 
 OWED = Owed("a", "image", 2 * SECOND, 4 * SECOND)
 
@@ -28,14 +28,9 @@ OWED = Owed("a", "image", 2 * SECOND, 4 * SECOND)
 class OwingNodes(FakeNodes):
     """held: nodes that are frozen."""
 
-    def __init__(self, calls: Calls, root: Path) -> None:
-        super().__init__(calls)
-        self.root = root
+    def __init__(self, root: Path, pipes: FakePipes, calls: Calls) -> None:
+        super().__init__(root, pipes, calls)
         self.held: set[str] = set()
-
-    @property
-    def places(self) -> tuple[Path, CellPaths]:
-        return self.root, CellPaths(self.root)
 
     def is_held(self, node: str) -> bool:
         return node in self.held
@@ -53,7 +48,7 @@ class Bench(ReloadBench):
 
     def __init__(self, root: Path, *owes: Owed) -> None:
         super().__init__(root)
-        self.owing = OwingNodes(self.calls, root)
+        self.owing = OwingNodes(root, self.pipes, self.calls)
         self.run = Run(self.pump, self.owing, self.pipes, Swapper(self.pump, self.dora))
         options = self.options._replace(owes=owes or (OWED,))
         self.python = "/venv/bin/python"
