@@ -4,6 +4,7 @@ import errno
 import gc
 import os
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
@@ -39,10 +40,13 @@ def _leave(status: int) -> NoReturn:
     os._exit(status)
 
 
-def run(arguments: list[str]) -> int:
-    """Run doractl; the exit status. Errors have been printed, in two lines or as JSON."""
+def run(arguments: list[str], dispatch: Callable[[list[str]], int] | None = None) -> int:
+    """Run doractl; the exit status. Errors have been printed, in two lines or as JSON.
+
+    dispatch: does what the arguments want.
+    """
     try:
-        status = _dispatch(arguments)
+        status = (dispatch or _dispatch)(arguments)
         sys.stdout.flush()
         return status
     except DoraSystemdError as error:

@@ -31,6 +31,22 @@ def print_machines(scope: Scope, context: click.Context) -> int | None:
     Returns the exit status; None if that are the logs of this machine alone. Raises
     DoraSystemdError: USAGE for a machine that the dataflow does not have.
     """
+    found = find_machines(scope, context)
+    if found is None:
+        return None
+    hosts, plan = found
+    # Each object of a program says where it is from, also if there is one machine only.
+    output = context.params["output"]
+    if len(hosts) > 1 or output == "json":
+        return run_on_all(hosts, plan)
+    return pass_through(hosts[0], plan._replace(words=[*plan.words, "-o", output]))
+
+
+def find_machines(scope: Scope, context: click.Context) -> tuple[list[Host], Plan] | None:
+    """The machines whose logs are meant, and what to ask them; None for this machine alone.
+
+    Raises DoraSystemdError as print_machines().
+    """
     given = context.params
     wanted, selectors = given["machine"], given["selectors"]
     if wanted and len(selectors) != 1:
@@ -55,7 +71,7 @@ def print_machines(scope: Scope, context: click.Context) -> int | None:
     names = [wanted] if wanted else _machines_of(cell.options.placed, given["nodes"], known)
     if names == [HEAD]:
         return None
-    return _print([_host_of(one, known, cell.name) for one in names], cell.name, context)
+    return [_host_of(one, known, cell.name) for one in names], _plan(cell.name, context)
 
 
 def _running(bus: Bus, selector: str, wanted: str) -> Cell | None:
@@ -98,15 +114,11 @@ def _host_of(name: str, known: dict[str, Host | None], dataflow: str) -> Host:
     return host._replace(text=name)
 
 
-def _print(hosts: Sequence[Host], name: str, context: click.Context) -> int:
+def _plan(name: str, context: click.Context) -> Plan:
     given = context.params
     words = ["logs", name, *_given_words(context), f"--machine={HEAD}"]
     is_endless = bool(given["is_follow"] or given["until_end"])
-    plan = Plan("logs", words, words, given, False, False, is_endless, "machine")
-    # Each object of a program says where it is from, also if there is one machine only.
-    if len(hosts) > 1 or given["output"] == "json":
-        return run_on_all(hosts, plan)
-    return pass_through(hosts[0], plan._replace(words=[*words, "-o", given["output"]]))
+    return Plan("logs", words, words, given, False, False, is_endless, "machine")
 
 
 def _given_words(context: click.Context) -> Iterator[str]:

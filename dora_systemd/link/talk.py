@@ -29,7 +29,10 @@ _COMPLAINT = 4096
 
 
 class Talk:
-    """One connection. rest: what the runner has said already. on_turn: called every second."""
+    """One connection. rest: what the runner has said already. on_turn: called every second.
+
+    answer_seconds: for the first line of the member. beat_seconds: of the wait for it.
+    """
 
     def __init__(
         self,
@@ -38,7 +41,10 @@ class Talk:
         mark: str,
         rest: bytes,
         on_turn: Callable[[], None] = lambda: None,
+        answer_seconds: float = ANSWER_SECONDS,
+        beat_seconds: float = BEAT_SECONDS,
     ) -> None:
+        self._answer_seconds, self._beat_seconds = answer_seconds, beat_seconds
         self._on_turn = on_turn
         self._runner, self._ssh = runner, ssh
         self._output, self._errors = AfterMark(mark), AfterMark(mark)
@@ -62,10 +68,10 @@ class Talk:
 
     def carry(self) -> None:
         """Carry until either end has ended."""
-        deadline = time.monotonic() + ANSWER_SECONDS
+        deadline = time.monotonic() + self._answer_seconds
         while not self._is_over:
             self._on_turn()
-            for fd, _ in self._poll.poll(BEAT_SECONDS * 1000):
+            for fd, _ in self._poll.poll(self._beat_seconds * 1000):
                 self._take(fd)
             if not self._has_answered:
                 self._wait_for_answer(deadline)
@@ -80,7 +86,7 @@ class Talk:
         """Tell the runner that ssh is on its way: the member cannot do so yet."""
         self._send(format_message(Beat()))
         if time.monotonic() > deadline:
-            self._excuse = f"no answer within {ANSWER_SECONDS:g} s"
+            self._excuse = f"no answer within {self._answer_seconds:g} s"
             self._end()
 
     def _end(self) -> None:

@@ -11,13 +11,15 @@ from dora_systemd.decisions.machines.wire import PORT_RANGE, Forwards
 from dora_systemd.errors import DoraSystemdError
 
 
-def choose_ports(members: Sequence[str], addresses: Sequence[str] = ()) -> Forwards:
+def choose_ports(
+    members: Sequence[str], addresses: Sequence[str] = (), ports: Sequence[int] = PORT_RANGE
+) -> Forwards:
     """Ports that are free here, other ones each time. Raises DoraSystemdError if there are none.
 
     addresses: of the options; the daemon here listens on the first one.
     """
-    begin = int.from_bytes(os.urandom(4)) % len(PORT_RANGE)
-    turned = (*PORT_RANGE[begin:], *PORT_RANGE[:begin])
+    begin = int.from_bytes(os.urandom(4)) % len(ports)
+    turned = (*ports[begin:], *ports[:begin])
     own = addresses[:1]
     free = (
         port
@@ -27,5 +29,5 @@ def choose_ports(members: Sequence[str], addresses: Sequence[str] = ()) -> Forwa
     try:
         return Forwards(next(free), {one: next(free) for one in (HEAD, *members)})
     except StopIteration:
-        message = f"cannot find free ports from {PORT_RANGE.start} to {PORT_RANGE.stop - 1}"
+        message = f"cannot find free ports from {ports[0]} to {ports[-1]}"
         raise DoraSystemdError(message, "see: ss -ltn") from None

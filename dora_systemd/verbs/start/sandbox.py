@@ -40,10 +40,12 @@ def make_sandbox(
     user: pwd.struct_passwd | None,
     prepared: Prepared,
     sight: Sight | None = None,
+    offers_identity: bool | None = None,
 ) -> Sandbox:
     """The sandbox of the settings. Raises DoraSystemdError for a path that does not exist.
 
     user: of the nodes, None in user scope. sight: that of this user; None: the caller's.
+    offers_identity: whether the machine can create a user namespace; None: ask it.
     """
     sight = sight or Sight()
     options = prepared.plan.options
@@ -62,7 +64,7 @@ def make_sandbox(
         is_realtime=settings[REALTIME] is not None or any(one.priority for one in rights),
         has_rights=has_process_rights(rights) or any(map(has_cpus, options.node_limits)),
         # In a user namespace the given capabilities would have no effect.
-        has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
+        has_identity=_has_identity(user, offers_identity) and not _names(settings, *_CAPABILITIES),
         needed=needed,
         writable=writable,
         firm={} if scope.is_user else _firm((*needed, *writable), user),
@@ -104,13 +106,13 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
         yield "a private network in user scope needs user namespaces, see systemd.exec(5)"
 
 
-def _has_identity(user: pwd.struct_passwd | None) -> bool:
+def _has_identity(user: pwd.struct_passwd | None, is_offered: bool | None) -> bool:
     """Whether `user` fits into a user namespace with the first 65536 ids, and the machine has one.
 
     Directory services assign higher ids.
     """
     is_known = user is None or max(user.pw_uid, user.pw_gid) < _IDENTITY
-    return is_known and _offers_identity()
+    return is_known and (_offers_identity() if is_offered is None else is_offered)
 
 
 def _offers_identity() -> bool:

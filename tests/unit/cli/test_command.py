@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from itertools import product
 from pathlib import Path
@@ -219,13 +219,13 @@ def test_what_list_selects(requests: list[ListRequest]) -> None:
     assert not ListRequest().is_filtered
 
 
-def fail_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `list` raise it."""
+def failing(error: BaseException) -> Callable[[list[str]], int]:
+    """A verb that raises it."""
 
-    def fail(_request: ListRequest) -> int:
+    def fail(_arguments: list[str]) -> int:
         raise error
 
-    monkeypatch.setattr(listing, "print_dataflows", fail)
+    return fail
 
 
 @pytest.mark.parametrize(
@@ -238,11 +238,9 @@ def fail_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_exit_status_of_errors(
     error: BaseException,
     status: int,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    fail_with(error, monkeypatch)
-    assert main.run(["list"]) == status
+    assert main.run(["list"], failing(error)) == status
     expected = "doractl: cannot do it\nhint: do that\n" if status != 130 else ""
     assert capsys.readouterr().err == expected
 
@@ -261,14 +259,15 @@ def test_any_error_of_the_system_is_one_line(
     error: OSError,
     said: str,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    fail_with(error, monkeypatch)
-    given_up: list[bool] = []
-    monkeypatch.setattr(main, "_give_up_output", lambda: given_up.append(True))
-    assert main.run(["list"]) == ExitCode.FAILURE
-    assert capsys.readouterr().err == f"doractl: {said}"
-    assert any(given_up) is ("write output" in said)  # else what was done would not be printed
+    given_up: list[int] = []
+    monkeypatch.setattr(os, "dup2", lambda *fds: given_up.extend(fds))
+    assert main.run(["list"], failing(error)) == ExitCode.FAILURE
+    monkeypatch.undo()
+    assert capfd.readouterr().err == f"doractl: {said}"
+    # Else what was done would not be printed.
+    assert (given_up[1:] == [sys.stdout.fileno()]) is ("write output" in said)
 
 
 def test_a_reader_that_went_away_is_no_error() -> None:
@@ -415,14 +414,11 @@ def test_names_of_files_in_any_encoding(tmp_path: Path) -> None:
 def test_a_mistake_of_ours_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(_: list[str]) -> int:
-        raise TypeError("oh")
-
-    monkeypatch.setattr(main, "_dispatch", fail)
-    assert main.run(["list"]) == 1
+    fail = failing(TypeError("oh"))
+    assert main.run(["list"], fail) == 1
     said = capsys.readouterr().err.splitlines()
     assert said[0] == "doractl: internal error in doractl (TypeError: oh)"
     assert "DORACTL_DEBUG" in said[1]
     monkeypatch.setenv("DORACTL_DEBUG", "1")
     with pytest.raises(TypeError):
-        main.run(["list"])
+        main.run(["list"], fail)

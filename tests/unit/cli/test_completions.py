@@ -1,5 +1,6 @@
 """What the shells are told at the Tab key, as far as no systemd is needed for it."""
 
+import os
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -7,11 +8,16 @@ from pathlib import Path
 import click
 import pytest
 
-from dora_systemd.cli import completion, main
-from dora_systemd.cli.completion import TYPES, VARIABLE, Live
+from dora_systemd.cli import main
+from dora_systemd.cli.completion import TYPES, VARIABLE
 from dora_systemd.cli.group import HIDDEN, VERBS, doractl
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases.listing import store_of
 from tests.unit.checkout import CHECKOUT
+from tests.unit.fakes.journal import FakeJournal
+from tests.unit.fakes.library import FakeSystemd, fake_systemd
+from tests.unit.fakes.manager import UUID, FakeManager, options
 from tests.unit.fakes.programs import make_program
 from tests.unit.tools import require
 
@@ -35,10 +41,13 @@ def complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.fixture
-def running(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = Live(lambda _ctx, _incomplete: ["robot", "rover", "vision"])
-    monkeypatch.setitem(completion.TYPES, "selector", names)
-    monkeypatch.setitem(completion.TYPES, "selectors", names)
+def systemd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSystemd:
+    """One with three dataflows."""
+    FakeJournal(monkeypatch, tmp_path)
+    manager = FakeManager()
+    for number, name in enumerate(("robot", "rover", "vision")):
+        manager.add(options(name, UUID[:-1] + str(number)))
+    return fake_systemd(monkeypatch, manager)
 
 
 def test_verbs(complete: Complete) -> None:
@@ -50,7 +59,7 @@ def test_verbs(complete: Complete) -> None:
     assert complete("doractl node ") == ["plain,restart", "plain,stop"]
 
 
-@pytest.mark.usefixtures("running")
+@pytest.mark.usefixtures("systemd")
 @pytest.mark.parametrize("verb", ["stop", "show", "list", "ps", "node restart", "stop --user"])
 def test_dataflows(verb: str, complete: Complete) -> None:
     assert complete(f"doractl {verb} ro") == ["plain,robot", "plain,rover"]
@@ -89,34 +98,27 @@ def test_hosts(complete: Complete, monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
 
 def test_dataflows_of_this_machine_are_not_there(
-    complete: Complete, monkeypatch: pytest.MonkeyPatch
+    complete: Complete, systemd: FakeSystemd, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def fail(*_: object) -> None:
-        raise AssertionError("the names are those of this machine")
-
-    monkeypatch.setattr(completion, "_bus", fail)
-    monkeypatch.setattr("dora_systemd.verbs.releases.listing.store_of", fail)
-    lines = ("-H base stop ", "stop -H base ", "logs --host=base --node ", "-H base rollback x ")
-    for words in lines:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    release = "20261121T220012"
+    store_of(Scope(True, os.getuid()), "x").release(release).mkdir(parents=True)
+    assert complete("doractl rollback --user x ") == [f"plain,{release}"]
+    lines = ("-H base stop ", "stop -H base ", "logs --host=base --node ")
+    for words in (*lines, "-H base rollback --user x "):
         assert complete(f"doractl {words}") == []
+    assert not systemd.timeouts, "nobody has asked it"
 
 
-def test_start_takes_a_file_or_what_has_ended(
-    complete: Complete, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(completion, "dataflow_names", lambda *_: ["robot", "vision"])
-    assert complete("doractl start ro") == ["plain,robot", "file,ro"]
+@pytest.mark.usefixtures("systemd")
+def test_start_takes_a_file_or_what_has_ended(complete: Complete) -> None:
+    assert complete("doractl start rob") == ["plain,robot", "file,rob"]
     assert complete("doractl start ") == ["file,"]
     assert complete("doractl run ro") == ["file,ro"]
 
 
-def test_what_cannot_be_found_out_is_no_error(
-    complete: Complete, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(_ctx: click.Context, _incomplete: str) -> list[str]:
-        raise DoraSystemdError("cannot reach systemd")
-
-    monkeypatch.setitem(TYPES, "selector", Live(fail))
+def test_what_cannot_be_found_out_is_no_error(complete: Complete, systemd: FakeSystemd) -> None:
+    systemd.refuses = DoraSystemdError("cannot reach systemd")
     assert complete("doractl show ") == []
 
 

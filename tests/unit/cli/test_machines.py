@@ -1,9 +1,7 @@
 """`doractl logs` of several machines: which ones, and with which options."""
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,6 +14,7 @@ from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import LINK_PREFIX
 from dora_systemd.scope import scope_of
+from tests.unit.fakes.library import fake_systemd
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.verbs.facts.test_machines import WORDS
 
@@ -24,33 +23,25 @@ GPU = Host("gpu", "alice@gpu-box", "2222")
 HEAD = Host("head", "")
 
 
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Sequence[Host], Plan]]:
-    """What the machines were asked for."""
-    found: list[tuple[Sequence[Host], Plan]] = []
-
-    def take(hosts: Sequence[Host] | Host, plan: Plan) -> int:
-        found.append(([hosts] if isinstance(hosts, Host) else hosts, plan))
-        return 0
-
+@pytest.fixture(autouse=True)
+def systemd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One with a dataflow on two machines, and with another one."""
     manager = FakeManager()
     manager.add(options("robot", placed=PLACED))
     manager.add(options("alone", "660e8400-e29b-41d4-a716-446655440000"))
     manager.units["doralink-robot:gpu.service"] = {"ExecStart": [[WORDS[0], WORDS, False]]}
-    monkeypatch.setattr(machines, "Bus", lambda *_, **__: manager)
-    monkeypatch.setattr(machines, "run_on_all", take)
-    monkeypatch.setattr(machines, "pass_through", take)
-    return found
+    fake_systemd(monkeypatch, manager)
 
 
-def printed(*words: str) -> int | None:
+def found(*words: str) -> tuple[list[Host], Plan] | None:
     with command.make_context("logs", list(words)) as context:
-        return machines.print_machines(scope_of(None), context)
+        return machines.find_machines(scope_of(None), context)
 
 
-def test_all_machines(asked: list[Any]) -> None:
-    assert printed("robot", "-n", "5", "--follow", "--since=1h", "-o", "json", "-b") == 0
-    ((hosts, plan),) = asked
+def test_all_machines() -> None:
+    asked = found("robot", "-n", "5", "--follow", "--since=1h", "-o", "json", "-b")
+    assert asked
+    hosts, plan = asked
     assert hosts == [HEAD, GPU]
     assert plan.words == [
         *("logs", "robot", "--follow", "--tail=5", "--boot=0", "--since=1h", "--machine=head"),
@@ -67,9 +58,9 @@ def test_all_machines(asked: list[Any]) -> None:
         (("--node", "yolo", "--node", "camera"), [HEAD, GPU]),
     ],
 )
-def test_some_machines(asked: list[Any], words: tuple[str, ...], hosts: list[Host]) -> None:
-    assert printed("robot", *words) == 0
-    assert asked[0][0] == hosts
+def test_some_machines(words: tuple[str, ...], hosts: list[Host]) -> None:
+    asked = found("robot", *words)
+    assert asked and asked[0] == hosts
 
 
 @pytest.mark.parametrize(
@@ -82,9 +73,8 @@ def test_some_machines(asked: list[Any], words: tuple[str, ...], hosts: list[Hos
         ("rob*",),
     ],
 )
-def test_this_machine_only(asked: list[Any], words: tuple[str, ...]) -> None:
-    assert printed(*words) is None
-    assert not asked
+def test_this_machine_only(words: tuple[str, ...]) -> None:
+    assert found(*words) is None
 
 
 @pytest.mark.parametrize(
@@ -97,18 +87,16 @@ def test_this_machine_only(asked: list[Any], words: tuple[str, ...]) -> None:
         (("nothing", "--machine", "gpu"), ExitCode.NOT_FOUND),
     ],
 )
-def test_wrong_machines(asked: list[Any], words: tuple[str, ...], code: ExitCode) -> None:
+def test_wrong_machines(words: tuple[str, ...], code: ExitCode) -> None:
     with pytest.raises(DoraSystemdError) as caught:
-        printed(*words)
+        found(*words)
     assert caught.value.code is code
-    assert not asked
 
 
-def test_another_scope_is_not_merged(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_scope_is_not_merged(capsys: pytest.CaptureFixture[str]) -> None:
     other = scope_of(os.getuid() == 0)
     with command.make_context("logs", ["robot"]) as context:
         assert machines.print_machines(other, context) is None
-    assert not asked
     assert "the logs of gpu are left out" in capsys.readouterr().err
 
 

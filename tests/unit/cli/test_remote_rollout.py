@@ -2,7 +2,9 @@
 
 import json
 import os
+import pwd
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -10,7 +12,6 @@ from dora_systemd.cli import main
 from dora_systemd.cli.remote import rollout
 from dora_systemd.decisions.releases.parcel import parse_parcel
 from dora_systemd.errors import ExitCode
-from dora_systemd.verbs.releases import send
 from tests.lab.pace import bound
 from tests.unit.fakes.programs import make_program
 
@@ -47,6 +48,10 @@ echo '"details": {"release": "20261121T220012", "former": null}}'
 """
 
 
+def getpwnam(name: str) -> NoReturn:
+    raise KeyError(name)
+
+
 @pytest.fixture(autouse=True)
 def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What was asked of doractl, by host."""
@@ -55,7 +60,7 @@ def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     # Where that user exists, it reads the project for root, and cannot read this one.
-    monkeypatch.setattr(send, "DEFAULT_USER", "nobody-has-this-name")
+    monkeypatch.setattr(pwd, "getpwnam", getpwnam)
     (tmp_path / "robot").mkdir()
     (tmp_path / "robot/a.py").write_text("print")
     (tmp_path / "robot/dataflow.yml").write_text("nodes: [{id: a, path: a.py}]\n")

@@ -5,6 +5,7 @@ It knows the calls of the gateway's doers, and no types: a word is a value of it
 
 import json
 import os
+import re
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping
@@ -87,7 +88,7 @@ class FakeSystemd:
             return self.manager.unit_path()
         if name == "InvocationID" and self.lives:
             return self.lives.pop(0)()
-        unit = part.replace("_2d", "-").replace("_2e", ".")
+        unit = re.sub("_([0-9a-f]{2})", lambda code: chr(int(code[1], 16)), part)
         return self.manager.read(unit, [name])[name]
 
     def _job(self, method: str, unit: str) -> str:

@@ -18,7 +18,6 @@ from dora_systemd.decisions.machines.wire import (
     format_message,
     parse_message,
 )
-from dora_systemd.link import talk
 from dora_systemd.link.program import Program
 from dora_systemd.link.talk import Talk
 
@@ -28,7 +27,9 @@ READY = b'{"type": "ready", "work": "/run/x"}\n'
 class Far:
     """A member: what runs in the place of ssh, and a runner that hears it."""
 
-    def __init__(self, script: str, said: bytes = b"") -> None:
+    def __init__(self, script: str, said: bytes = b"", *seconds: float) -> None:
+        """seconds: for the answer, and of a wait for it."""
+        self._seconds = seconds
         self.runner, self.ours = socket.socketpair()
         self.heard = b""
         self.status = 0
@@ -39,7 +40,7 @@ class Far:
         hearing = Thread(target=self._hear)
         hearing.start()
         with self.runner, self.ours, Program("sh", ["-c", self._script]) as ssh:
-            one = Talk(self.ours, ssh, "mark", self._said)
+            one = Talk(self.ours, ssh, "mark", self._said, lambda: None, *self._seconds)
             one.carry()
             self.status = ssh.end()
             one.part_from("b", self.status)
@@ -125,9 +126,7 @@ def test_a_line_without_an_end_is_not_kept() -> None:
     assert far.run() == [Lost("it says something else than a member does")]
 
 
-def test_a_member_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(talk, "ANSWER_SECONDS", 0.1)
-    monkeypatch.setattr(talk, "BEAT_SECONDS", 0.05)
-    far = Far("echo mark; exec cat")
+def test_a_member_that_says_nothing() -> None:
+    far = Far("echo mark; exec cat", b"", 0.1, 0.05)
     assert far.run() == [Lost("no answer within 0.1 s")]
     assert far.heard.count(b"beat") > 1

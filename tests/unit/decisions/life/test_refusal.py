@@ -64,7 +64,9 @@ def test_a_refused_start_leaves_no_unit(wait: bool) -> None:
     assert UNIT not in manager.units
 
 
-def test_a_start_that_is_not_waited_for_waits_for_the_first_word() -> None:
+def test_a_start_that_is_not_waited_for_waits_for_the_first_word(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     manager = FakeManager()
     states: list[dict[str, Any]] = [
         {"ActiveState": "inactive", "Job": [7, "/job"]},
@@ -78,7 +80,7 @@ def test_a_start_that_is_not_waited_for_waits_for_the_first_word() -> None:
         manager.units[unit] |= states.pop(0)
         return []
 
-    manager.changes = changes  # type: ignore[assignment,method-assign]
+    monkeypatch.setattr(manager, "changes", changes)
     manager.add(options(), **states.pop(0))
     manager.after_job[UNIT] = {"ActiveState": "inactive", "Job": [7, "/job"]}
     with pytest.raises(DoraSystemdError, match="cannot use x"):

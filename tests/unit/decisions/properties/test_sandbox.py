@@ -22,7 +22,6 @@ from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.sight import Sight
-from dora_systemd.verbs.start import sandbox as sandbox_module
 from dora_systemd.verbs.start.sandbox import _maps_identity, make_sandbox, sandbox_warnings
 from tests.unit.fakes.manager import options
 
@@ -272,6 +271,7 @@ def made(
     nodes: str = "/opt/x/camera",
     user: pwd.struct_passwd = ME,
     sight: Sight | None = None,
+    offers_identity: bool | None = None,
     **flags: object,
 ) -> Sandbox:
     own = options(
@@ -280,7 +280,8 @@ def made(
     document = {"nodes": [{"id": "a", "path": nodes, "outputs": ["x"]}]}
     plan = LaunchPlan(own, "/l.sh", "/nowhere", os.path.exists, Sight().read)
     prepared = Prepared(parse_dataflow(document, "flow.yml"), plan, {})
-    return make_sandbox(SYSTEM, resolve_settings(flags, {}, []), user, prepared, sight)
+    settings = resolve_settings(flags, {}, [])
+    return make_sandbox(SYSTEM, settings, user, prepared, sight, offers_identity)
 
 
 def test_what_a_plan_needs(tmp_path: Path) -> None:
@@ -335,21 +336,18 @@ def test_choices_of_a_plan(tmp_path: Path) -> None:
     [(990, 990, True), (65535, 65535, True), (65536, 990, False), (990, 200_000, False)],
 )
 def test_users_of_a_directory_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uid: int, gid: int, has_identity: bool
+    tmp_path: Path, uid: int, gid: int, has_identity: bool
 ) -> None:
     """Their ids are not in the namespace."""
-    monkeypatch.setattr(sandbox_module, "_offers_identity", lambda: True)
     user = pwd.struct_passwd(("robot", "x", uid, gid, "", "/", "/bin/sh"))
-    assert made(tmp_path, user=user).has_identity == has_identity
+    assert made(tmp_path, user=user, offers_identity=True).has_identity == has_identity
 
 
 @pytest.mark.parametrize("key", ["AmbientCapabilities", "CapabilityBoundingSet"])
-def test_capabilities_that_are_given_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str
-) -> None:
-    monkeypatch.setattr(sandbox_module, "_offers_identity", lambda: True)
+def test_capabilities_that_are_given_count(tmp_path: Path, key: str) -> None:
     user = pwd.struct_passwd(("robot", "x", 990, 990, "", "/", "/bin/sh"))
-    assert not made(tmp_path, user=user, property=(f"{key}=CAP_NET_RAW",)).has_identity
+    given = (f"{key}=CAP_NET_RAW",)
+    assert not made(tmp_path, user=user, offers_identity=True, property=given).has_identity
 
 
 @pytest.mark.parametrize(

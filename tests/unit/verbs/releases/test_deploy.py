@@ -135,9 +135,11 @@ def test_what_start_has_started_is_not_touched(bench: Bench) -> None:
     assert not bench.store.path.exists()
 
 
-def test_a_deploy_that_cannot_begin_leaves_no_release(bench: Bench) -> None:
+def test_a_deploy_that_cannot_begin_leaves_no_release(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = bench.deploy()
-    bench.manager.reload = lambda: bench.fail("cannot reload")  # type: ignore[method-assign]
+    monkeypatch.setattr(bench.manager, "reload", lambda: bench.fail("cannot reload"))
     assert refused(bench).message == "cannot reload"
     assert [*bench.releases] == [first.release]
 

@@ -1,10 +1,10 @@
 """enable, disable and export against a fake systemd and real files."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.host.process import Completed
 from dora_systemd.adapters.host.unit_files import put_unit_file, read_unit_file
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.file import says_the_same
@@ -17,7 +17,6 @@ from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.list import find_row
 from dora_systemd.verbs.show import unit_files
-from dora_systemd.verbs.start import linger
 from dora_systemd.verbs.start.enable import (
     boot_target,
     disable_cell,
@@ -28,6 +27,7 @@ from dora_systemd.verbs.start.enable import (
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.stop import stop_cells
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.fakes.programs import make_program
 
 UNIT = "dora-robot.service"
 
@@ -187,7 +187,9 @@ def test_disabled_while_it_runs_from_its_file(manager: FakeManager, scope: Scope
     assert not runtime.exists()
 
 
-def test_after_its_end_the_file_counts(manager: FakeManager, scope: Scope) -> None:
+def test_after_its_end_the_file_counts(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cell = started(manager)
     enable_cell(manager, scope, cell)
     manager.calls.clear()
@@ -198,7 +200,7 @@ def test_after_its_end_the_file_counts(manager: FakeManager, scope: Scope) -> No
         real(units)
         manager.units[UNIT]["Transient"] = False
 
-    manager.disable_unit_files = disable  # type: ignore[method-assign,assignment]
+    monkeypatch.setattr(manager, "disable_unit_files", disable)
     stop_cells(manager, scope, [cell])
     link = ("enable", str(path_of(manager)))
     stop = ("StopUnit", UNIT)
@@ -242,14 +244,13 @@ def test_list_marks_it(manager: FakeManager, scope: Scope) -> None:
         (["", 1], "as root: loginctl enable-linger root"),
     ],
 )
-def test_linger(answers: list[str | int], note: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    rest = iter(answers)
-
-    def run(_command: object, _seconds: float) -> Completed:
-        answer = next(rest)
-        return Completed(0, answer, "") if isinstance(answer, str) else Completed(answer, "", "")
-
-    monkeypatch.setattr(linger, "run_command", run)
+def test_linger(
+    answers: list[str | int], note: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said, *status = answers
+    answer = f"*show-user*) printf '{said}';; *) exit {status[0] if status else 9};;"
+    make_program(tmp_path / "bin/loginctl", f'case "$*" in {answer} esac')
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
     assert note in ensure_linger(Scope(is_user=True, uid=0))
     assert (note == "") == (ensure_linger(Scope(is_user=False, uid=0)) == note)
 
