@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import REACHED_AS
-from dora_systemd.terminal_text import escaped
+from dora_systemd.terminal_text import escaped, one_line
 
 _STANDARD = ("stdin", "stdout", "stderr")
 """By the number of their descriptors."""
@@ -141,6 +141,8 @@ def print_error(error: DoraSystemdError, is_json: bool) -> None:
 
         print_object("error", error_object(error))
         return
+    for line in error.lines:
+        print(f"  {one_line(line)}", file=sys.stderr)
     print(f"doractl: {error.message}", file=sys.stderr)
     if error.hint:
         print(f"hint: {error.hint}", file=sys.stderr)

@@ -1,6 +1,7 @@
 """The one error class, and the exit statuses of doractl."""
 
 import os
+from collections.abc import Sequence
 from enum import IntEnum
 
 
@@ -31,11 +32,18 @@ class DoraSystemdError(Exception):
     """A request of the user that cannot be done.
 
     message: one line that names the file, key or unit. hint: what to do about it, or "". code: the
-    exit status of doractl.
+    exit status of doractl. lines: the last lines of the node that is the reason, oldest first.
     """
 
-    def __init__(self, message: str, hint: str = "", code: ExitCode = ExitCode.FAILURE) -> None:
+    def __init__(
+        self,
+        message: str,
+        hint: str = "",
+        code: ExitCode = ExitCode.FAILURE,
+        lines: Sequence[str] = (),
+    ) -> None:
         super().__init__(message)
+        self.lines = tuple(lines)
         self.message = " ".join(message.split())
         self.hint = " ".join(hint.split())
         self.code = code

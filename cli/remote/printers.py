@@ -160,6 +160,9 @@ class Complaints:
     def _print_words(self, host: Host, value: dict[str, object]) -> None:
         for found in (value.get("error"), value.get("warning")):
             if isinstance(found, dict):
+                lines = found.get("lines")
+                for line in lines if isinstance(lines, list) else ():
+                    print(f"{host.text}:   {one_line(str(line))}", file=sys.stderr)
                 print(
                     f"doractl: {host.text}: {one_line(str(found.get('message')))}", file=sys.stderr
                 )

@@ -9,6 +9,7 @@ from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches
+from dora_systemd.decisions.releases.past import FAILED as TRIAL_FAILED
 from dora_systemd.decisions.releases.past import Switch, completed, undone
 from dora_systemd.decisions.views.dataflows import DEGRADED, FAILED, FROZEN
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -49,12 +50,27 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     budget = None
     if cell and not verdict.is_given_up:
         budget = restart_budget(manager, scope, cell, read_status(scope, cell))
+    last = _undone(scope, subject)
     words = _last_words(journal, scope, subject, verdict)
+    is_of_trial = not words and last is not None and last.how == TRIAL_FAILED
+    if last and is_of_trial:
+        words = _trial_words(journal, scope, subject, last)
     inhibitors = read_holders(scope, [cell.name]).get(cell.name, ()) if cell else ()
     is_held = cell is not None and _is_held(scope, cell, verdict.node)
     machines = _machines(manager, cell) if cell and cell.options.placed else {}
-    last = _undone(scope, subject)
-    return Report(subject, verdict, words, budget, inhibitors, is_held, machines, last)
+    facts_of_trial = (last, is_of_trial)
+    return Report(subject, verdict, words, budget, inhibitors, is_held, machines, *facts_of_trial)
+
+
+def _trial_words(
+    journal: JournalReader, scope: Scope, subject: Subject, end: Switch
+) -> tuple[Word, ...]:
+    """The last lines of the node that failed in the trial of a release, or of all nodes."""
+    matches = scope_matches(scope, subject.name)
+    matches += [f"DORA_NODE={end.node}"] if end.node else []
+    matches += [f"_SYSTEMD_INVOCATION_ID={end.invocation}"] if end.invocation else []
+    records = journal.newest(matches, None, until_us=end.at_us, is_whole=True)
+    return choose_last(records, LINES)
 
 
 def _undone(scope: Scope, subject: Subject) -> Switch | None:

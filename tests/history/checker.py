@@ -92,6 +92,21 @@ def everything_is_flat(history: History) -> Iterator[str]:
             yield f"{name}: {first.anonymous} KiB of memory became {last.anonymous} KiB"
 
 
+def rollbacks_choose_what_ran_well(history: History) -> Iterator[str]:
+    """A rollback without a release never runs one that failed, or that one has gone back from."""
+    for cell, ran in history.ran.items():
+        bad: set[object] = set()
+        for one in ran:
+            is_trial = one["ended"] in ("failed", "interrupted")
+            to, is_rollback = one["to"], "(doractl rollback)" in (one["by"] or "")
+            if is_rollback and not is_trial and to != one["from"] and to in bad:
+                yield f"{cell}: a rollback from {one['from']} chose {to}, which was known as bad"
+            if one["ended"] in ("failed", "rolled-back"):
+                bad.add(one["from"])
+            if not is_trial:
+                bad.discard(to)
+
+
 INVARIANTS: dict[str, Invariant] = {
     one.__name__: one
     for one in (
@@ -105,7 +120,7 @@ INVARIANTS: dict[str, Invariant] = {
             answers_are_orderly,
             an_error_says_something,
         ),
-        *(nothing_is_left, everything_is_flat),
+        *(nothing_is_left, everything_is_flat, rollbacks_choose_what_ran_well),
     )
 }
 

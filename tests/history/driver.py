@@ -1,11 +1,13 @@
 """Carries out the steps of a history, and records what comes of them."""
 
+import json
 import shutil
 import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dora_systemd.adapters.releases.store import store_root
 from tests.history import member
@@ -89,6 +91,7 @@ class Driver:
             tuple(sorted(inventory() - before)),
             tuple(end),
             {cell: restart_times(cell, since) for cell in CELLS},
+            {cell: _ran(cell) for cell in CELLS},
         )
 
     def _do(self, at: int, step: Step) -> None:
@@ -175,6 +178,12 @@ class Driver:
             shutil.rmtree(store_root() / cell, ignore_errors=True)
         member.forget(self.scene.root)
         self.scene.front.end()
+
+
+def _ran(cell: str) -> tuple[dict[str, Any], ...]:
+    """What ran of a dataflow that was deployed, oldest first."""
+    done = Cell(cell).doractl("releases", cell, "--history", "-o", "json", check=False)
+    return tuple(json.loads(done.stdout)[::-1]) if done.returncode == 0 else ()
 
 
 def _becomes_quiet() -> bool:

@@ -96,7 +96,8 @@ class History:
     node, how many lines it noted. lines: the journal's, in its order. lost: by cell, lines that the
     journal has counted as lost. restarts: by cell, when systemd has said that it restarts the unit
     by itself, CLOCK_MONOTONIC. left: what is there at the end and was not at the beginning. end:
-    the answers of the commands that end the history.
+    the answers of the commands that end the history. ran: by cell, the objects of `doractl releases
+    --history`, oldest first.
     """
 
     steps: tuple[Step, ...] = ()
@@ -109,3 +110,4 @@ class History:
     left: tuple[str, ...] = ()
     end: tuple[Answer, ...] = ()
     restarts: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    ran: Mapping[str, tuple[Mapping[str, Any], ...]] = field(default_factory=dict)

@@ -64,13 +64,26 @@ def test_a_release_runs_and_is_not_what_it_was_copied_from(
 def test_a_first_version_that_is_bad_leaves_nothing_running(
     releases: Releases, project: Project
 ) -> None:
-    write_version(project, "bad", "raise SystemExit(3)\n")
+    cell = releases.cell
+    write_version(project, "bad", 'print("no camera", flush=True)\nraise SystemExit(3)\n')
     said = releases.deploy(project.root, status=11)
     assert "node a: exit code 3" in said
+    assert "  a: no camera\n" in said
     assert "nothing of it runs" in said
     assert (releases.running(), list(releases.states().values())) == ("", ["failed"])
-    assert not (ETC / releases.cell.unit).exists()
+    assert not (ETC / cell.unit).exists()
     assert not releases.trial.exists()
+    why = json.loads(cell.doractl("why", cell.name, "-o", "json").stdout)
+    assert [line["text"] for line in why["last_lines"]] == ["no camera"]
+    assert why["undone"]["node"] == "a"
+    # And nothing of it is kept, if nobody wants it.
+    asked = cell.doractl("forget", cell.name, check=False)
+    assert (asked.returncode, "use --force" in asked.stderr) == (2, True)
+    assert "Dataflow forgotten" in cell.doractl("forget", cell.name, "--force").stdout
+    assert not releases.path.exists()
+    wait_for("list does without", lambda: cell.name not in cell.doractl("list", "--all").stdout)
+    again = cell.doractl("start", cell.name, check=False)
+    assert (again.returncode, "no dataflow named" in again.stderr) == (4, True)
 
 
 @pytest.mark.warns(

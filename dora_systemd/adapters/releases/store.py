@@ -135,6 +135,17 @@ class Store:
             self.release(release_id).rename(gone)
             remove_tree(gone)
 
+    def remove_all(self) -> None:
+        """Remove all releases, and the history last. Raises DoraSystemdError, OSError."""
+        for one in self.known():
+            self.remove(one.id)
+        rest = [*self.path.iterdir()]
+        for path in sorted(rest, key=lambda one: one.name == HISTORY):
+            remove_tree(path)
+        if left := next(self.path.iterdir(), None):
+            message = f"cannot remove {shown(str(left))}: something holds or creates files in it"
+            raise DoraSystemdError(message, f"see: find {shown(str(left))}")
+
     def _names(self) -> list[str]:
         try:
             return [path.name for path in self.path.iterdir()]

@@ -65,10 +65,10 @@ def _format_stopping(cell: Cell) -> str:
     left = [ident for ident, node in cell.nodes.items() if node.state in WITH_PROCESS]
     if not left:
         return "stopping"
-    text = f"stopping, {_names(left)} left"
+    text = f"stopping, waiting for {_names(left)}"
     if cell.grace == INFINITY:
         return text
-    return f"{text}, killed after {format_duration(kill_delay(cell.grace))}"
+    return f"{text} (killed if not ended within {format_duration(kill_delay(cell.grace))})"
 
 
 def _format_waiting(cell: Cell) -> str:

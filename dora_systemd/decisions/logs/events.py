@@ -38,6 +38,9 @@ EVENTS = {
     "inhibited": EventKind(
         "6e439f1e51f147df87eb35cdd8e61cb1", INFO, "Dataflow {dataflow} inhibited by {by}"
     ),
+    "dataflow-forgotten": EventKind(
+        "4fce1228a6ba409ca61424d2cc89ddc5", NOTICE, "Dataflow {dataflow} forgotten by {by}"
+    ),
     "dataflow-finished": _dataflow("61a9895e49214871ae2381a42f2a1968", NOTICE, "finished"),
     "dataflow-stopped": _dataflow("5e9f54e3c8fa448fab7d9114ae8f8e87", NOTICE, "was stopped"),
     "dataflow-failed": _dataflow("99f4f6038d0146de8190e12fc9726881", ERR, "failed"),
@@ -149,6 +152,7 @@ NODE_END_EVENTS = ("node-exited", "node-crashed", "node-ended", "node-oom")
 
 ROLLED_BACK = "release-rolled-back"
 BUILD_FAILED = "build-failed"
+FORGOTTEN = "dataflow-forgotten"
 REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK, BUILD_FAILED)
 """What doractl writes about a dataflow, outside of its unit."""
 

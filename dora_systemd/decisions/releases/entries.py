@@ -57,6 +57,8 @@ def check_found(one: Found) -> None:
     elif one.kind == LINK:
         reason = _trouble_of_link(one.path, one.target)
         hint = "link to a file of the project, or copy what it leads to"
+        if one.target.startswith("/"):
+            hint = "link to a file of the project by a relative path, or copy what it leads to"
     elif one.kind != FILE:
         reason = f"it is a {one.kind}"
     if reason:
@@ -114,6 +116,8 @@ def _trouble_of_link(path: str, target: str) -> str:
     parts = [part for part in target.split("/") if part not in ("", ".")]
     ups = next((place for place, part in enumerate(parts) if part != ".."), len(parts))
     depth = len([part for part in posixpath.dirname(path).split("/") if part])
-    if target.startswith("/") or ups > depth:
+    if target.startswith("/"):
+        return f"it links to {shown(target)}, an absolute path, which is outside of every release"
+    if ups > depth:
         return f"it links to {shown(target)}, which is not in the project"
     return f"it links to {shown(target)}, with .. behind a name" if ".." in parts[ups:] else ""

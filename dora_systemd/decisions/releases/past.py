@@ -22,6 +22,7 @@ class Switch(NamedTuple):
 
     at_us: CLOCK_REALTIME µs. former: the release that ended, "" if none ran. release: the one that
     runs since, or "". how: why `former` ended, one of ENDS. by: who asked; "" if that is not known.
+    node: the one that failed, or "". invocation: of systemd, the life in which it did.
     """
 
     at_us: int
@@ -30,6 +31,8 @@ class Switch(NamedTuple):
     how: str
     by: str = ""
     reason: str = ""
+    node: str = ""
+    invocation: str = ""
 
     @property
     def is_commit(self) -> bool:
@@ -46,6 +49,8 @@ def format_switch(one: Switch) -> bytes:
         "ended": one.how,
         "by": _cut(one.by),
         "reason": _cut(one.reason),
+        "node": _cut(one.node),
+        "invocation": one.invocation,
     }
     return json.dumps(value).encode() + b"\n"
 
@@ -155,7 +160,9 @@ def _parse(line: bytes) -> Switch | None:
         former, release, how = str(value["from"]), str(value["to"]), str(value["ended"])
         at_us = int(value["at_us"])
         by, reason = str(value["by"]), str(value["reason"])
+        node, invocation = str(value["node"]), str(value["invocation"])
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
         return None
     is_ours = how in ENDS and all(not one or is_release_id(one) for one in (former, release))
-    return Switch(at_us, former, release, how, by, reason) if is_ours else None
+    texts = (by, reason, node, invocation)
+    return Switch(at_us, former, release, how, *texts) if is_ours else None

@@ -50,6 +50,7 @@ def switch_object(name: str, one: Switch) -> dict[str, Any]:
         "ended": one.how,
         "by": one.by or None,
         "reason": one.reason or None,
+        "node": one.node or None,
     }
 
 
@@ -132,4 +133,5 @@ def error_object(error: DoraSystemdError) -> dict[str, Any]:
         "message": error.message,
         "hint": error.hint or None,
         "exit_status": int(error.code),
+        "lines": list(error.lines),
     }

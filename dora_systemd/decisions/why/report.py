@@ -37,6 +37,7 @@ _GIVEN_UP = "systemd has stopped restarting it; doractl restart {name} resets th
 _WAITING = "systemd restarts it automatically; doractl stop {name} prevents that"
 _THERE = "doractl -H {host} why {name} tells what machine {machine} has seen"
 _AGAIN = "nothing: dora restarts {node} automatically"
+_FIX_RELEASE = "fix {node}, then run: doractl deploy --name {name}"
 _AWAY = "{node} stays down until doractl restart {name}; the other nodes keep running"
 _HELD = (
     "{node} stays down until its file is saved, which hot reload sees, or until "
@@ -62,7 +63,8 @@ class Report:
 
     inhibitors: who inhibits a restart now. is_held: verdict.node waits for a hot reload. machines:
     the other ones by name, each with its host, or "" if that is not known. undone: the last change
-    in the history of releases, if it was no new release.
+    in the history of releases, if it was no new release. is_of_trial: words are of the trial that
+    has failed, in which `undone` ended.
     """
 
     subject: Subject
@@ -73,14 +75,22 @@ class Report:
     is_held: bool = False
     machines: Mapping[str, str] = field(default_factory=dict)
     undone: Switch | None = None
+    is_of_trial: bool = False
+
+    @property
+    def node(self) -> str:
+        """The node of the last lines, "" for all nodes."""
+        return self.undone.node if self.undone and self.is_of_trial else self.verdict.node
 
 
 def remedies(report: Report) -> list[str]:
     """What to do, one line each."""
     verdict, subject = report.verdict, report.subject
     lines = (one.text for one in report.words)
-    hint = known_remedy(lines, verdict.node) if verdict.node else ""
+    hint = known_remedy(lines, report.node) if report.node else ""
     texts = [_AGAIN if verdict.is_passing else remedy_of(verdict)]
+    if report.is_of_trial and report.undone:
+        texts = [_FIX_RELEASE] if report.node else []
     machine = verdict.details.get("machine", "")
     if host := report.machines.get(machine):
         texts.append(_THERE)
@@ -92,7 +102,7 @@ def remedies(report: Report) -> list[str]:
         texts.append(_WAITING)
     values = {
         "name": subject.name,
-        "node": verdict.node or "the node",
+        "node": report.node or "the node",
         "file": subject.file or "FILE",
         "unit": subject.unit,
         "flag": subject.flag,
@@ -255,14 +265,15 @@ def _clock(moment: int) -> str:
 
 
 def _words_title(report: Report) -> str:
-    node = report.verdict.node
+    node = report.node
     count = "line" if len(report.words) == 1 else f"{len(report.words)} lines"
     every = f"doractl logs {report.subject.name}" + (f" --node {node}" if node else "")
-    return f"The last {count} of {node or 'its nodes'} (all: {every}):"
+    release = f" in {report.undone.former}" if report.undone and report.is_of_trial else ""
+    return f"The last {count} of {node or 'its nodes'}{release} (all: {every}):"
 
 
 def _words(report: Report) -> list[str]:
-    node, shown = report.verdict.node, shown_last(report.words, LINES)
+    node, shown = report.node, shown_last(report.words, LINES)
     return [f"{_clock(one.at_us)[6:]}  {_line(one, node)}" for one in shown]
 
 

@@ -9,6 +9,8 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.failures import later_failures
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent, is_volatile
 from dora_systemd.decisions.life.causes import NO_END
+from dora_systemd.decisions.logs.events import FORGOTTEN
+from dora_systemd.decisions.logs.query import request_matches
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -107,8 +109,18 @@ def ended_row(event: LastEvent) -> DataflowRow:
 def _last_events(scope: Scope, **what: Any) -> list[LastEvent]:
     # Without access to the journal, the rows from systemd are still shown.
     with contextlib.suppress(DoraSystemdError):
-        return _with_later_failures(scope, JournalReader().last_events(scope, **what))
+        events = JournalReader().last_events(scope, **what)
+        return _with_later_failures(scope, _remembered(scope, events) if events else [])
     return []
+
+
+def _remembered(scope: Scope, events: list[LastEvent]) -> list[LastEvent]:
+    """The events without those from before their dataflow was forgotten."""
+    at: dict[str, int] = {}
+    for record in JournalReader().newest(request_matches(scope, FORGOTTEN), None):
+        name = str(record.get("DORA_DATAFLOW_NAME", ""))
+        at.setdefault(name, int(record["__REALTIME_TIMESTAMP"]))
+    return [event for event in events if event.at_us > at.get(event.name, 0)]
 
 
 def _with_later_failures(scope: Scope, events: list[LastEvent]) -> list[LastEvent]:

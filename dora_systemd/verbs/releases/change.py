@@ -21,6 +21,7 @@ from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.progress import Step, going_back, judged, stopping, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
@@ -199,8 +200,9 @@ def _roll_back(
     note_request(ROLLED_BACK, name, uuid, change.by, **details, **reasons)
     return DoraSystemdError(
         f"release {change.release} of {name} was rolled back: {fault.reason}",
-        f"{now}; doractl why {name} tells more",
+        f"{now}; {known_remedy(fault.lines) or f'doractl why {name} tells more'}",
         ExitCode.ROLLED_BACK,
+        fault.lines,
     )
 
 

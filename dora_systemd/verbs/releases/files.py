@@ -47,6 +47,8 @@ class Target(Protocol):
 
 _MOST_LINKS = 40
 """As in Linux, see path_resolution(7)."""
+_POINTER, _MOST_POINTER = b"version https://git-lfs.github.com/spec/", 1024
+"""How a pointer of Git LFS begins, and the maximum bytes of one."""
 _AGAIN = "wait until nothing writes to the project, then deploy again"
 
 
@@ -64,7 +66,7 @@ def find_files(
         raise too_many("")
     if names is None:
         found = _walk(project, "")
-    found |= _below(project, [name.rstrip("/") for name in names or ()])
+    found |= _of_git(project, [name.rstrip("/") for name in names or ()])
     found |= _below(project, [path for path in (_real(one, found) for one in named) if path])
     if len(found) > MOST_FILES:
         raise too_many("")
@@ -74,11 +76,24 @@ def find_files(
     return dict(sorted(found.items())), revision if is_revision(revision) else ""
 
 
+def _of_git(project: Project, names: Sequence[str]) -> dict[str, Found]:
+    """The files that git names. Raises DoraSystemdError for a submodule that is not there."""
+    found: dict[str, Found] = {}
+    for one in _existing(project, names):
+        # git names the directory of a repository in the repository, and nothing in it.
+        inner = _walk(project, one.path) if one.kind == DIRECTORY else {one.path: one}
+        if not inner:
+            reason = "it is a repository of git without files, as a submodule that is not there"
+            hint = "git submodule update --init, then deploy again; or name it in .gitignore"
+            raise refusal(one.path, reason, hint)
+        found |= inner
+    return found
+
+
 def _below(project: Project, paths: Sequence[str]) -> dict[str, Found]:
     """The files with these paths, as far as they exist, and those of directories."""
     found: dict[str, Found] = {}
     for one in _existing(project, list(dict.fromkeys(paths))):
-        # git names the directory of a repository in the repository, and nothing in it.
         found |= _walk(project, one.path) if one.kind == DIRECTORY else {one.path: one}
     return found
 
@@ -177,10 +192,20 @@ def _copy(
             if error.errno not in (errno.EMLINK, errno.EPERM, errno.ENOENT):
                 raise
     chunks = _bounded(project.read(one.path), one.path, one.size, count)
+    if one.size <= _MOST_POINTER:
+        chunks = _no_pointer([*chunks], one.path)
     stored = draft.write(one.path, chunks, one.is_executable)
     if stored.size != one.size:
         raise _changed(one.path)
     return stored
+
+
+def _no_pointer(chunks: list[bytes], path: str) -> Iterator[bytes]:
+    """The chunks of a file. Raises DoraSystemdError for what Git LFS has put in its place."""
+    if b"".join(chunks).startswith(_POINTER):
+        reason = "it is a pointer of Git LFS, and not the file itself"
+        raise refusal(path, reason, "git lfs pull, then deploy again")
+    yield from chunks
 
 
 def _is_same(project: Project, one: Found, old: Stored, count: Count) -> bool:

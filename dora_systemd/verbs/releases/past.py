@@ -41,7 +41,8 @@ def note_fault(store: Store, standing: Standing, release: str, fault: Fault, by:
         is_noted = last and last.former == release and last.how in (FAILED, INTERRUPTED)
         if not (is_noted and fault.reason == KILLED):
             how = FAILED if fault.is_verdict else INTERRUPTED
-            switch = (release, standing.current, how, requester(by), fault.reason)
+            texts = (requester(by), fault.reason, fault.node, fault.invocation)
+            switch = (release, standing.current, how, *texts)
             _record(store, standing, [Switch(_now_us(), *switch)])
 
 

@@ -7,6 +7,7 @@ journal tells as well: every crash and restart of a node is an event there.
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from itertools import takewhile
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager, queued_job
@@ -16,6 +17,7 @@ from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.progress import Step, soaking, starting, stopping
 from dora_systemd.decisions.why.faults import FAULT_IDS, Fault, find_fault, is_finished
+from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
 from dora_systemd.decisions.why.lives import Happening, parse_happening
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
@@ -29,6 +31,8 @@ Tell = Callable[[Step], None]
 START_LIMIT = 120 * SECOND
 """µs for all nodes to become ready, unless the dataflow's own start_timeout is longer."""
 LATE = "late"
+LINES = 10
+"""Maximum number of last lines of the node that failed."""
 _STEP_SECONDS = 0.2
 _LOOK_SECONDS = 1.0
 _MOST_RECORDS = 200
@@ -97,8 +101,20 @@ class Gate:
         with suppress(DoraSystemdError):  # systemd does not know a new unit
             self._manager.reset_failed(self._unit)
         self._manager.queue_job("RestartUnit", self._unit)
-        fault = self._wait_ready(start_limit)
-        return fault or self._soak(soak)
+        fault = self._wait_ready(start_limit) or self._soak(soak)
+        return fault and self._with_lines(fault)
+
+    def _with_lines(self, fault: Fault) -> Fault:
+        """Add what the node that failed has written last; of all nodes, if none is known."""
+        invocation = self._invocation()
+        words: tuple[Word, ...] = ()
+        with suppress(DoraSystemdError):  # who may not read the journal has the reason only
+            matches = scope_matches(self._scope, self._options.name)
+            matches += [f"DORA_NODE={fault.node}"] if fault.node else []
+            records = JournalReader().newest(matches, None, is_whole=True)
+            words = choose_last(takewhile(self._is_new, records), LINES)
+        lines = tuple(f"{one.node}: {one.text}" for one in shown_last(words, LINES))
+        return fault._replace(invocation=invocation, lines=lines)
 
     def _wait_ready(self, limit: int) -> Fault | None:
         state = settle(self._manager, self._unit, limit, self._tell_start, self._has_failed)

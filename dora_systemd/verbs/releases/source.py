@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.releases.entries import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -201,8 +202,23 @@ def _check(plan: Plan, dataflow: Dataflow, root: str, want_build: bool) -> None:
         elif node.path.startswith(f"{root}/"):
             reason = f"its path {shown(node.path)} would be outside of the release"
             hint = f"write it relative to {shown(root)}"
+        else:
+            reason, hint = _trouble_of_path(node, plan.options.working_directory, root)
         if reason:
             raise _refusal(f"node {node.id}: {reason}", hint)
+
+
+def _trouble_of_path(node: Node, directory: str, root: str) -> tuple[str, str]:
+    """Why a node's path leads to a file that a release would not have, and what to do; or ""."""
+    place = os.path.normpath(Path(directory, node.working_directory, node.path))
+    if ".." not in node.path.split("/") or _is_below(place, root) or not exists(place):
+        return "", ""
+    above = os.path.commonpath([root, place])
+    hint = "move it into the project"
+    if above != "/":
+        path = shown(os.path.relpath(place, above))
+        hint = f"use --working-directory {shown(above)}, and write the path from there: {path}"
+    return f"its path {shown(node.path)} leads out of {shown(root)}", hint
 
 
 def _programs(dataflow: Dataflow, working_directory: str) -> Iterator[str]:

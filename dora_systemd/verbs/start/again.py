@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.logs.events import FORGOTTEN
 from dora_systemd.decisions.logs.query import request_matches
 from dora_systemd.decisions.settings.resolve import given_texts, is_given
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -151,8 +152,12 @@ def _refuse_released(scope: Scope, asked: Asked) -> None:
 
 
 def _asked(scope: Scope, matches: list[str]) -> Iterator[Asked]:
-    every = [*request_matches(scope, EVENT), *matches]
+    every, forgotten = [*request_matches(scope, EVENT, FORGOTTEN), *matches], set[object]()
     for record in JournalReader().newest(every, None, is_whole=True):
+        if record.get("DORA_EVENT") == FORGOTTEN:
+            forgotten.add(record.get("DORA_DATAFLOW_NAME"))
+        if record.get("DORA_DATAFLOW_NAME") in forgotten:
+            continue
         with suppress(ValueError, TypeError, AttributeError, RecursionError):
             if record.get("_PID") != _INIT and (found := _parse(record)):
                 yield found

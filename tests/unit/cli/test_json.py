@@ -98,6 +98,7 @@ def test_an_outcome_with_a_problem(manager: FakeManager, capsys: Printed) -> Non
         "message": "cannot restart robot: it was stopped while it started",
         "hint": "doractl --system why robot tells more",
         "exit_status": 1,
+        "lines": [],
     }
 
 
@@ -142,6 +143,7 @@ def test_errors(capsys: Printed) -> None:
             "message": "no dataflow named 'robbot'",
             "hint": "did you mean robot?",
             "exit_status": ExitCode.NOT_FOUND,
+            "lines": [],
         }
     wrong = error(capsys, "stop", "-o", "json")
     assert (wrong["message"], wrong["exit_status"]) == ("cannot stop: give names or --all", 2)

@@ -79,6 +79,16 @@ def last(of_a: CellView) -> dict[str, Any]:
     return {"looks": (look(1), look(3, of_a))}
 
 
+ROLLBACK = "root (doractl rollback)"
+
+
+def ran(former: str, release: str, ended: str, by: str = "root (doractl deploy)") -> dict[str, str]:
+    """A change of what runs."""
+    return {"from": former, "to": release, "ended": ended, "by": by}
+
+
+BACK = (ran("x", "y", "replaced"), ran("y", "x", "rolled-back", ROLLBACK))
+LATER = ran("w", "y", "rolled-back", ROLLBACK)
 NAMELESS = tuple(replace(line, has_unit=False) for line in GOOD.lines)
 
 
@@ -129,7 +139,17 @@ BROKEN: list[tuple[str, dict[str, Any]]] = [
     ("nothing_is_left", {"end": (answer(-1, "disable", 4), answer(-1, "destroy", 1))}),
     ("everything_is_flat", {"looks": GROWN}),
     ("everything_is_flat", {"looks": OPENED}),
+    ("rollbacks_choose_what_ran_well", {"ran": {A: (*BACK, ran("x", "y", "replaced", ROLLBACK))}}),
+    ("rollbacks_choose_what_ran_well", {"ran": {A: (ran("y", "x", "failed"), LATER)}}),
 ]
+
+
+def test_a_rollback_to_what_ran_well() -> None:
+    again = (*BACK, ran("x", "z", "replaced"), ran("z", "x", "rolled-back", ROLLBACK))
+    interrupted = ran("x", "z", "interrupted", ROLLBACK)
+    named = (*BACK, ran("x", "y", "replaced"), ran("y", "w", "replaced"), LATER)
+    for found in (BACK, again, (*BACK, interrupted), named):
+        assert check(replace(GOOD, ran={A: found})) == []
 
 
 def test_a_good_history_breaks_nothing() -> None:

@@ -28,7 +28,7 @@ def test_status_lines() -> None:
         (cell(State.RUNNING, a="running", b="finished"), "1/2 nodes running; finished: b"),
         (
             replace(cell(State.STOPPING, a="running", b="stopped"), grace=10_000_000),
-            "stopping, a left, killed after 15s",
+            "stopping, waiting for a (killed if not ended within 15s)",
         ),
         (cell(State.STOPPING, a="stopped"), "stopping"),
         (cell(State.CLOSING), "asking dora how the dataflow ended"),

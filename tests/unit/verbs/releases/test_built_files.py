@@ -57,7 +57,7 @@ def test_the_interpreter_of_a_virtual_environment(root: Path, project: Project) 
     assert ".venv/bin/python3" in found_in(project, is_user=True)
     link.unlink()
     (root / ".venv/bin/other").symlink_to("/bin/sh")
-    with pytest.raises(DoraSystemdError, match="not in the project"):
+    with pytest.raises(DoraSystemdError, match="outside of every release"):
         found_in(project, is_user=True)
 
 
@@ -81,7 +81,7 @@ def test_links_by_the_path_of_the_release(root: Path, project: Project) -> None:
     assert "built/link" in found_in(project)
     (root / "built/link").unlink()
     (root / "built/link").symlink_to(f"{TREE}/built/../../../x")
-    with pytest.raises(DoraSystemdError, match="not in the project"):
+    with pytest.raises(DoraSystemdError, match="outside of every release"):
         found_in(project)
 
 

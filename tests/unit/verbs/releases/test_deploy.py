@@ -205,3 +205,22 @@ def test_other_verbs_wait_for_the_end_of_a_trial(bench: Bench) -> None:
     cell = read_standing(bench.manager, bench.scope, UNIT).cell
     assert cell is not None
     refuse_on_trial(bench.scope, cell, "set limits of")
+
+
+def test_a_path_that_leads_out_of_the_project(bench: Bench) -> None:
+    bench.write("dataflow.yml", FLOW.replace("a.py", "../lib/x.py"))
+    (bench.project.parent / "lib").mkdir()
+    (bench.project.parent / "lib/x.py").write_text("")
+    error = refused(bench)
+    assert f"its path ../lib/x.py leads out of {bench.project}" in error.message
+    above = bench.project.parent
+    assert error.hint == (
+        f"use --working-directory {above}, and write the path from there: lib/x.py"
+    )
+
+
+def test_an_absolute_link_to_a_file_of_the_project(bench: Bench) -> None:
+    (bench.project / "link").symlink_to(bench.project / "a.py")
+    error = refused(bench)
+    assert "an absolute path, which is outside of every release" in error.message
+    assert "by a relative path" in error.hint

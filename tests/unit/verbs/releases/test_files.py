@@ -141,3 +141,45 @@ def test_a_file_that_changes_meanwhile(
     with pytest.raises(DoraSystemdError, match=r"cannot copy a\.py: it changed"):
         copied(project, store, found)
     assert store.known() == []
+
+
+def test_what_git_has_not_brought_is_refused_by_name(root: Path, project: Project) -> None:
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 70000000\n"
+    (root / "models/m.onnx").write_text(pointer)
+    with pytest.raises(DoraSystemdError, match=r"models/m\.onnx: it is a pointer of Git LFS") as e:
+        copied_all(project, root)
+    assert "git lfs pull" in e.value.hint
+    (root / "models/m.onnx").write_text(f"read {pointer}")
+    copied_all(project, root)
+
+
+def test_a_submodule_that_is_not_there_is_refused(root: Path) -> None:
+    def git(*words: str, at: Path = root) -> None:
+        name = ("-c", "user.name=a", "-c", "user.email=a", "-c", "protocol.file.allow=always")
+        subprocess.run(["git", "-C", str(at), *name, *words], check=True, capture_output=True)
+
+    library = root.parent / "library"
+    library.mkdir()
+    for place in (library, root):
+        git("init", "-q", at=place)
+    (library / "x.py").write_text("x")
+    git("add", ".", at=library)
+    git("commit", "-qm", "x", at=library)
+    git("submodule", "add", str(library), "lib")
+    owners = [root.stat().st_uid]
+    with opened_project(str(root), None) as project:
+        assert "lib/x.py" in find_files(project, [], owners)[0]
+    git("submodule", "deinit", "-f", "lib")
+    with (
+        opened_project(str(root), None) as project,
+        pytest.raises(DoraSystemdError, match="cannot copy lib: it is a repository of git") as e,
+    ):
+        find_files(project, [], owners)
+    assert "git submodule update" in e.value.hint
+
+
+def copied_all(project: Project, root: Path) -> None:
+    """Copy the project into a store of its own."""
+    store = Store(root.parent / "other", "robot")
+    store.path.mkdir(parents=True, exist_ok=True)
+    copy_files(project, find_files(project, [], [])[0], Draft(store), None, lambda *_: None)

@@ -1,9 +1,11 @@
 """What deploy and rollback write to the history, and what they and others read in it."""
 
 import os
+from pathlib import Path
 
 import pytest
 
+from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import HISTORY, Store, locked
 from dora_systemd.decisions.releases.manifest import Manifest
@@ -15,6 +17,7 @@ from dora_systemd.decisions.views.releases import (
     release_object,
 )
 from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.decisions.why.report import format_report
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.deploy import prune
@@ -22,8 +25,10 @@ from dora_systemd.verbs.releases.listing import read_history, read_releases, sto
 from dora_systemd.verbs.releases.past import KILLED, note_fault, note_run, read_past
 from dora_systemd.verbs.releases.rollback import roll_back
 from dora_systemd.verbs.releases.trial import Standing, read_standing
+from dora_systemd.verbs.why import explain
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager
-from tests.unit.verbs.releases.test_trial import UNIT, etc, release_options, text_of
+from tests.unit.verbs.releases.test_trial import UNIT, release_options, text_of
 
 A, B, C, D = (f"2026112{day}T220012" for day in range(1, 5))
 FAULT = Fault("node a: exit code 1", "a")
@@ -34,6 +39,11 @@ class Robot:
 
     def __init__(self, manager: FakeManager, scope: Scope, store: Store) -> None:
         self.manager, self.scope, self.store = manager, scope, store
+
+    @property
+    def unit_file(self) -> Path:
+        """The unit file of what every start runs."""
+        return self.manager.etc / "systemd/user" / UNIT
 
     @property
     def standing(self) -> Standing:
@@ -51,9 +61,9 @@ class Robot:
             self.add(release)
         before = self.standing
         self.store.prove(release)
-        etc(self.manager).parent.mkdir(parents=True, exist_ok=True)
-        etc(self.manager).write_text(text_of(release))
-        path = str(etc(self.manager))
+        self.unit_file.parent.mkdir(parents=True, exist_ok=True)
+        self.unit_file.write_text(text_of(release))
+        path = str(self.unit_file)
         self.manager.add(release_options(release), Transient=False, FragmentPath=path)
         if is_noted:
             note_run(self.store, before, release, by)
@@ -197,3 +207,22 @@ def test_a_history_that_nobody_can_read(robot: Robot) -> None:
     note_run(robot.store, robot.standing, A, "x")
     prune(robot.manager, robot.scope, robot.store, 1, B)
     assert len(robot.store.known()) == 2
+
+
+def test_why_has_the_lines_of_a_trial(robot: Robot, tmp_path: Path) -> None:
+    """Although another node ran on until doractl stopped it, or an older release runs again."""
+    life = {"_SYSTEMD_INVOCATION_ID": "2" * 32, "DORA_NODE": "a"}
+    record = {**life, "MESSAGE": "no camera", "DORA_STREAM": "stderr"}
+    with pytest.MonkeyPatch.context() as patch:
+        journal = FakeJournal(patch, tmp_path / "root")
+        line = life_record("x", 5, scope=robot.scope, **record)
+        del line["DORA_EVENT"]
+        journal.write(line)
+        robot.run(A)
+        robot.fail(B, FAULT._replace(invocation="2" * 32))
+        report = explain(robot.manager, robot.scope, "robot", JournalReader())
+    assert [one.text for one in report.words] == ["no camera"]
+    text = format_report(report)
+    assert f"The last line of a in {B} (all: doractl logs robot --node a):" in text
+    assert "fix a, then run: doractl deploy --name robot" in text
+    assert f"Undone:   {B} at" in text

@@ -17,6 +17,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.receive import receive
+from dora_systemd.verbs.releases.rollback import roll_back
 from dora_systemd.verbs.start.plan import StartRequest
 from tests.unit.fakes.deploys import FLOW, Bench
 from tests.unit.fakes.manager import options
@@ -126,3 +127,23 @@ def test_what_start_has_started_is_not_replaced(sender: Sender) -> None:
         sender.send(FILES)
     assert caught.value.code is ExitCode.NAME_IN_USE
     assert sender.answers == [], "nothing has been sent for it"
+
+
+def test_what_is_sent_goes_through_the_same_decisions(sender: Sender) -> None:
+    """A bad release, its rollback and the next one: neither --keep nor a rollback confuse them."""
+    good, bad = (sender.send({**FILES, "b.py": f"print({n})"}).release for n in range(2))
+
+    def go_back() -> str:
+        return roll_back(
+            sender.manager, sender.scope, "robot", None, 0, sender.steps.append
+        ).release
+
+    assert go_back() == good
+    third = sender.send({**FILES, "b.py": "print(3)"}).release
+    assert sender.releases == {good: "proved", bad: "rolled-back", third: "current"}
+    sender.manager.state = "failed"
+    with pytest.raises(DoraSystemdError):
+        sender.send({**FILES, "b.py": "print(4)"})
+    sender.manager.state = "active"
+    assert go_back() == good
+    assert [*sender.releases.values()] == ["current", "rolled-back", "failed"]

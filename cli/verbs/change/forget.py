@@ -1,0 +1,58 @@
+"""Remove releases, or all that is kept of a dataflow."""
+
+import sys
+
+import click
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.releases.forget import Kept, find_kept, forget, remove_releases
+
+
+@click.command("forget")
+@click.argument("selector")
+@click.argument("releases", nargs=-1, metavar="[RELEASE]...")
+@click.option("--force", is_flag=True, help="Do not ask; needed without a terminal.")
+@acting_options
+def command(selector: str, releases: tuple[str, ...], force: bool) -> int:
+    """Remove all that is kept of a dataflow: its releases, their history, its place in list --all.
+
+    With RELEASE, only these releases. What runs, is enabled or on trial is refused. The project and
+    the lines in the journal stay.
+
+    Examples:
+      doractl forget robot                        asks first
+      doractl forget robot 20261121T220012-9f3c1a2
+    """
+    scope = current_scope()
+    bus = Bus(scope)
+    if releases:
+        done = remove_releases(bus, scope, selector, releases)
+        return print_outcomes(_removed(kept, one) for kept, one in done)
+    kept = find_kept(bus, scope, selector)
+    if not (force or _agrees(kept)):
+        return ExitCode.INTERRUPTED
+    forget(bus, scope, kept)
+    details = {"releases": list(kept.releases)}
+    text = f"Dataflow forgotten: {kept.uuid or '-'} ({kept.name}), {_count(kept)}"
+    return print_outcomes([Outcome(kept, text, details=details)])
+
+
+def _removed(kept: Kept, release: str) -> Outcome:
+    text = f"Release removed: {release} ({kept.name})"
+    return Outcome(kept, text, details={"release": release})
+
+
+def _agrees(kept: Kept) -> bool:
+    """Ask the person at the terminal. Raises DoraSystemdError (USAGE) if there is none."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        message = f"cannot forget {kept.name}: nobody can be asked"
+        raise DoraSystemdError(message, "use --force", ExitCode.USAGE)
+    return click.confirm(f"Remove {_count(kept)} of {kept.name} for good?", err=True)
+
+
+def _count(kept: Kept) -> str:
+    count = len(kept.releases)
+    return f"{count} release{'' if count == 1 else 's'}"
