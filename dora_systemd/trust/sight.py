@@ -73,7 +73,10 @@ class Sight:
         return False
 
     def _ask(self, letter: bytes, path: str) -> bytes:
-        return eyes.answer(letter, os.fsencode(path), MAX_BYTES + 1)
+        try:
+            return eyes.answer(letter, os.fsencode(path), MAX_BYTES + 1)
+        except ValueError as error:  # a path with a null character; the child of a user says that
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
 
 
 class LentSight(Sight):

@@ -1,12 +1,19 @@
 """What another account is asked about paths, and what a hostile one can do with that."""
 
+import errno
+import os
 import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
-from dora_systemd.errors import DoraSystemdError
-from dora_systemd.trust.programs import own_account
-from dora_systemd.trust.sight import LentSight
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import Account, own_account
+from dora_systemd.trust.sight import LentSight, Sight, sight_of, start_reader
+from tests.unit.fakes.programs import make_program
 
 LONG = "/" + "x" * 4000
 """A pipe is full after some of these."""
@@ -23,3 +30,96 @@ def test_answers_to_questions_that_nobody_reads() -> None:
             for _ in range(64):
                 sight.exists(LONG)
         child.kill()
+
+
+OTHER = Account(65534, 65534, (65534,), "nobody")
+
+
+@pytest.fixture(params=["own", "other"])
+def sight(request: pytest.FixtureRequest) -> Iterator[Sight]:
+    """That of the caller, and of another user; the answers are the same."""
+    if request.param == "other" and os.geteuid() != 0:
+        pytest.skip("only root can ask as another user")
+    with sight_of(None if request.param == "own" else OTHER) as found:
+        yield found
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A directory that everybody may enter."""
+    with TemporaryDirectory(dir="/tmp") as name:
+        Path(name).chmod(0o755)
+        yield Path(name)
+
+
+def test_what_is_there(sight: Sight, place: Path) -> None:
+    make_program(place / "program", "exit")
+    (place / "link").symlink_to("program")
+    (place / "text").write_text("words")
+    os.utime(place / "text", ns=(5, 1_767_225_600_000_000_001))
+    (place / "text").chmod(0o644)
+    table = {
+        "program": (True, False, True),
+        "link": (True, False, True),
+        "text": (True, False, False),
+        "": (True, True, False),
+        "missing": (False, False, False),
+        "text/below": (False, False, False),
+    }
+    for name, answers in table.items():
+        path = str(place / name)
+        assert (sight.exists(path), sight.is_directory(path), sight.is_program(path)) == answers
+    assert sight.real(str(place / "link")) == str((place / "program").resolve())
+    assert sight.real(str(place / "missing")) == str(place.resolve() / "missing")
+    assert sight.real("/\0") == "/\0"
+    assert sight.read(str(place / "text")) == b"words"
+    assert sight.modified_ns(str(place / "text")) == 1_767_225_600_000_000_001
+    assert sight.modified_ns(str(place / "missing")) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        *(("missing", errno.ENOENT), ("", errno.EISDIR), ("fifo", errno.ENXIO)),
+        *(("x" * 5000, errno.ENAMETOOLONG), ("\0", errno.EINVAL)),
+    ],
+)
+def test_what_cannot_be_read(sight: Sight, place: Path, name: str, number: int) -> None:
+    os.mkfifo(place / "fifo", 0o644)
+    with pytest.raises(OSError) as caught:
+        sight.read(str(place / name))
+    assert (caught.value.errno, caught.value.strerror) == (number, os.strerror(number))
+
+
+def test_an_interpreter_that_the_account_cannot_reach() -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        start_reader(("/nowhere/python",), own_account())
+    name = own_account().name
+    assert caught.value.message == (
+        f"cannot start the dataflow as user {name}, who cannot reach {sys.executable}"
+    )
+    assert caught.value.hint == (
+        "put it where that user can read it, or choose another user with --uid"
+    )
+    assert caught.value.code is ExitCode.NO_PERMISSION
+
+
+def test_a_child_that_is_silent() -> None:
+    with subprocess.Popen(["sleep", "60"], stdin=-1, stdout=-1) as child:
+        with pytest.raises(DoraSystemdError) as caught:
+            LentSight(child, own_account(), 0.05).exists("/x")
+        child.kill()
+    assert caught.value.message == f"cannot look at /x as user {own_account().name}: no answer"
+    assert caught.value.hint == "see whether a mount of that user hangs"
+
+
+@pytest.mark.parametrize(
+    ("said", "number"),
+    [("-00000012", 2), ("-0000001x", errno.EINVAL), ("-000000599999", errno.EINVAL)],
+)
+def test_an_error_that_a_child_tells(said: str, number: int) -> None:
+    with subprocess.Popen(["sh", "-c", f"printf %s {said}; cat"], stdin=-1, stdout=-1) as child:
+        with pytest.raises(OSError) as caught:
+            LentSight(child, own_account()).read("/x")
+        child.kill()
+    assert caught.value.errno == number

@@ -4,15 +4,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.events import EVENTS, REQUESTS
 from dora_systemd.decisions.logs.query import (
+    UNIT_FAILED,
+    UNIT_STARTING,
     LogQuery,
     end_matches,
+    failure_matches,
     is_boot,
     journal_time,
     parse_level,
     query_arguments,
     query_matches,
+    request_matches,
+    scope_matches,
+    start_matches,
+    story_matches,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -148,3 +155,32 @@ def test_unknown_level() -> None:
 def test_end_of_unit() -> None:
     assert end_matches(SYSTEM, "robot")[:2] == ["UNIT=dora-robot.service", "_PID=1"]
     assert end_matches(USER, "robot")[:2] == ["USER_UNIT=dora-robot.service", "_UID=1000"]
+
+
+UID = "550e8400-e29b-41d4-a716-446655440000"
+ROOTS, ANNS = Scope(is_user=False, uid=0), Scope(is_user=True, uid=1000)
+
+
+def test_whose_records_a_question_finds() -> None:
+    """A user can write any field but those with an underscore, which journald sets."""
+    unit = "dora-robot.service"
+    starting = f"MESSAGE_ID={UNIT_STARTING}"
+    assert start_matches(ROOTS, "robot") == [f"UNIT={unit}", "_PID=1", starting]
+    assert start_matches(ANNS, "robot") == [f"USER_UNIT={unit}", "_UID=1000", starting]
+    ours = [f"DORA_DATAFLOW={UID}", "DORA_DATAFLOW=other"]
+    failed = ["_PID=1", f"MESSAGE_ID={UNIT_FAILED}", *ours]
+    assert failure_matches([UID, "other"]) == failed
+    asked = ["DORA_EVENT=a", "DORA_EVENT=b"]
+    assert request_matches(ROOTS, "a", "b") == [*asked, "_UID=0", "DORA_SCOPE=system"]
+    assert request_matches(ANNS, "a", "b") == [*asked, "_UID=1000", "DORA_SCOPE=user"]
+
+
+@pytest.mark.parametrize("scope", [ROOTS, ANNS])
+def test_a_story_has_three_sources(scope: Scope) -> None:
+    found = " ".join(story_matches(scope, "robot", UID)).split(" + ")
+    own, systemds, requests = (one.split(" ") for one in found)
+    events = [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
+    assert own == [*scope_matches(scope, "robot"), f"DORA_DATAFLOW={UID}", *events]
+    assert [*systemds, f"MESSAGE_ID={UNIT_STARTING}"] == start_matches(scope, "robot")
+    asked = [f"DORA_EVENT={event}" for event in REQUESTS]
+    assert requests == [f"DORA_DATAFLOW={UID}", *asked, f"_UID={scope.uid}"]

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.logs.events import EVENTS
-from dora_systemd.decisions.releases.progress import Step
+from dora_systemd.decisions.releases.progress import Step, starting, stopping
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
@@ -153,3 +154,81 @@ def test_a_crash_ends_the_wait_for_all_nodes(
     manager.units[unit]["Job"] = (1, "/")
     assert gate._wait_ready(120 * SECOND) == Fault("node camera: exit code 1", "camera")
     assert clock[0] < 1002
+
+
+def record(event: str, **fields: str) -> dict[str, str]:
+    return {**crash(1001), "DORA_EVENT": event, "DORA_NODE": "", "DORA_EXIT": "", **fields}
+
+
+WORDS = f"{FAILED_BECAUSE}node camera: exit code 1 after 2 restarts"
+CRASHED = Fault("node camera: exit code 1", "camera")
+STOPPED = Fault("it was stopped", is_stop=True)
+REFUSED = {"StatusText": "failed: cannot use x: y; hint: z", "ExecMainStatus": 72}
+
+
+@pytest.mark.parametrize(
+    ("records", "facts", "fault"),
+    [
+        ([], {}, STOPPED),
+        ([record("dataflow-finished")], {}, None),
+        ([record("dataflow-stopped")], {}, STOPPED),
+        ([record("dataflow-stopped"), record("dataflow-finished")], {}, STOPPED),
+        ([crash(1001)], {"StatusText": WORDS}, Fault(WORDS[len(FAILED_BECAUSE) :], "camera")),
+        ([crash(1001)], {"StatusText": f"{WORDS}, node b: signal SIGKILL"}, CRASHED),
+        ([crash(1001)], {"StatusText": WORDS.replace("camera", "plot")}, CRASHED),
+        ([], REFUSED, Fault("cannot use x: y")),
+        ([], {"ActiveState": "failed", **REFUSED}, Fault("cannot use x: y")),
+        ([], {"ActiveState": "failed", "Result": "watchdog"}, Fault(HUNG)),
+        ([], {"SubState": "auto-restart", "ActiveState": "activating"}, Fault("exit code 0")),
+    ],
+)
+def test_what_its_end_means(
+    manager: FakeManager,
+    scope: Scope,
+    clock: list[float],
+    journal: list[dict[str, str]],
+    records: list[dict[str, str]],
+    facts: dict[str, object],
+    fault: Fault | None,
+) -> None:
+    assert clock
+    unit = manager.add(options(), "inactive", InvocationID=b"")
+    gate = Gate(manager, scope, options(), lambda _: None)
+    manager.units[unit] |= facts
+    journal += records
+    assert gate._wait_ready(SECOND) == fault
+
+
+def test_what_is_told_until_it_is_ready(scope: Scope, clock: list[float]) -> None:
+    """First what runs now stops, and the status text of a unit that is down is an old one."""
+    lives = [
+        ("active", "0 nodes"),
+        ("deactivating", "stopping, a left"),
+        ("inactive", "old"),
+        ("activating", "1/3 nodes ready"),
+    ]
+
+    class Changing(FakeManager):
+        def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+            if "StatusText" in names:
+                active, status = lives.pop(0) if lives else ("active", "3/3 nodes running")
+                self.units[unit] |= {"ActiveState": active, "StatusText": status}
+                self.units[unit]["Job"] = (1 if lives or active != "active" else 0, "/")
+            return super().read(unit, names)
+
+    manager, told = Changing(), list[Step]()
+    manager.add(options(), InvocationID=b"")
+    expected = [*map(stopping, (lives[0][1], lives[1][1])), starting(""), starting(lives[3][1])]
+    assert Gate(manager, scope, options(), told.append)._wait_ready(120 * SECOND) is None
+    assert told == expected
+    assert clock[0] == pytest.approx(1000.8)
+
+
+def test_nodes_that_are_not_ready_in_time(
+    manager: FakeManager, scope: Scope, clock: list[float]
+) -> None:
+    manager.add(options(), "activating", InvocationID=b"", StatusText="0/3 nodes ready")
+    gate = Gate(manager, scope, options(), lambda _: None)
+    late = Fault("not all nodes are ready after 3s")
+    assert gate._wait_ready(3 * SECOND) == late
+    assert clock[0] == pytest.approx(1003.1, abs=0.2)
