@@ -64,6 +64,10 @@ fuzz:  ## feed what reads other people's bytes, for SECONDS=n
 	@$(PREPARE)
 	@FUZZ_SECONDS=$(SECONDS) $(CHECK) fuzz
 
+mutants:  ## change the product in SAMPLE=n places, chosen by SEED=n, and see whether unit tests notice
+	@$(PREPARE)
+	@SEED=$(SEED) SAMPLE=$(SAMPLE) $(CHECK) mutants
+
 browser:  ## the status page in headless Chromium; LAB_OUT=DIR keeps pictures of it
 	@$(PREPARE) container
 	@$(CHECK) browser
@@ -108,4 +112,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm faults history power fuzz browser machines bench bench-quick bookworm lint demo clean deb autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm faults history power fuzz mutants browser machines bench bench-quick bookworm lint demo clean deb autopkgtest

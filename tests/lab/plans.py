@@ -15,10 +15,12 @@ from lab.cache import find_cache
 from lab.changed import changed_rooms
 from lab.definition import CHECKOUT
 from lab.errors import LabError
+from lab.process import need_root
 from lab.steps import Step, run_steps
-from lab.venv import ensure_venv, venv_environment, write_package
+from lab.venv import add_package, ensure_venv, venv_environment, write_package
 
 LAB_PYTHON = (3, 13)
+MUTMUT = "mutmut==3.8.1"
 FAULTS = "tests/system/faults"
 # Containers at the same time. Most of the time of a test is waiting, and one more than three makes
 # two cores so busy that the tests wait for each other.
@@ -201,6 +203,20 @@ def plan_fuzz(_form: str) -> list[Step]:
     return [Step("fuzzing", ["python", "-m", "tests.fuzz", seconds], in_venv)]
 
 
+def plan_mutants(_form: str) -> list[Step]:
+    """Changes to the product, SAMPLE of them chosen by SEED, and how many unit tests notice."""
+    need_root()  # for mounts and processes of its own
+    asked = ("--seed", "SEED", "1"), ("--sample", "SAMPLE", "1000")
+    chosen = [word for flag, name, usual in asked for word in (flag, os.environ.get(name) or usual)]
+    return [Step("mutants", ["python", "-m", "tests.mutants", *chosen], in_venv_with_mutmut)]
+
+
+def in_venv_with_mutmut() -> dict[str, str]:
+    venv = ensure_venv(find_cache())
+    add_package(venv, MUTMUT)
+    return venv_environment(venv)
+
+
 def plan_quick(_form: str) -> list[Step]:
     """The heart of the system tests."""
     files = [f"tests/system/test_{name}.py" for name in QUICK]
@@ -251,6 +267,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "history": plan_history,
     "power": plan_power,
     "fuzz": plan_fuzz,
+    "mutants": plan_mutants,
     "other-python": plan_other_python,
     "lab": plan_lab,
     "vm": plan_vm,

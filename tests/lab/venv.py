@@ -61,6 +61,16 @@ def build_venv(venv: Path, packages: list[str], log: Path) -> None:
         (venv / "finished").touch()
 
 
+def add_package(venv: Path, package: str) -> None:
+    """Install what only one target needs, unless it is there."""
+    note = venv / f"with-{package}"
+    if not note.exists():
+        with Stage(f"{package} from PyPI into {venv}"):
+            pip = [str(venv / "bin/python"), "-m", "pip", "install", package]
+            run_logged(pip, venv / "more.log", f"install {package}")
+            note.touch()
+
+
 def write_skeleton(venv: Path) -> Path:
     """The checkout by links, so that setuptools does not write its egg-info into the checkout."""
     skeleton = venv / "checkout"

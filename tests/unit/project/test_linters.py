@@ -49,7 +49,7 @@ def test_mypy(pytestconfig: pytest.Config) -> None:
     cache = str(cache_directory(pytestconfig, "mypy"))
     config = f"--config-file={CHECKOUT / 'pyproject.toml'}"
     sources = ["dora_systemd", "benchmarks", "tests/unit", "tests/system", "tests/boot"]
-    sources += ["tests/history", "tests/fuzz", "tests/machines"]
+    sources += ["tests/history", "tests/fuzz", "tests/machines", "tests/mutants"]
     run(["mypy", config, *sources], place, {"MYPY_CACHE_DIR": cache})
 
 
