@@ -19,9 +19,10 @@ from dora_systemd.terminal_text import escaped, one_line
 _STANDARD = ("stdin", "stdout", "stderr")
 """By the number of their descriptors."""
 VERBS = (
-    *("deploy", "destroy", "disable", "doctor", "dora", "enable", "env", "export", "inhibit"),
-    *("list", "logs", "machine", "member", "node", "releases", "reload", "reset", "restart"),
-    *("rollback", "run", "set", "setup", "show", "start", "stop", "top", "up", "version", "why"),
+    *("deploy", "destroy", "disable", "doctor", "dora", "enable", "env", "export"),
+    *("forget", "inhibit", "list", "logs", "machine", "member", "node", "releases", "reload"),
+    *("reset", "restart", "rollback", "run", "set", "setup", "show", "start", "stop", "top"),
+    *("up", "version", "why"),
 )
 """As in group.py, which takes longer to import than most commands."""
 

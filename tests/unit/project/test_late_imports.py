@@ -92,7 +92,8 @@ LATE = {
         "adapters.dora.preparation": {"adapters.dora.probe", "decisions.machines.part"},
         "runner.owes.begin": {"runner.owes.watch"},
         "verbs.facts.reading": {
-            *("decisions.machines.usage", "decisions.owes.probe", "verbs.facts.held"),
+            *("decisions.machines.usage", "decisions.owes.feeds", "decisions.owes.probe"),
+            "verbs.facts.held",
         },
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {

@@ -4,7 +4,7 @@ import pytest
 
 from dora_systemd.decisions.releases.past import REMOVED
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.releases.forget import find_kept, forget, remove_releases
+from dora_systemd.verbs.releases.forget import Kept, find_kept, forget, remove_releases
 from tests.unit.verbs.releases.test_past import A, B, C, Robot, robot, scope
 from tests.unit.verbs.releases.test_trial import UNIT
 
@@ -26,7 +26,7 @@ def test_all_that_is_kept(robot: Robot) -> None:
         robot.store.tree(release).chmod(0o555)
     end(robot)
     kept = find_kept(robot.manager, robot.scope, "robot")
-    assert kept == ("robot", "u", (A, B, C))
+    assert kept == Kept("robot", "u", (A, B, C))
     forget(robot.manager, robot.scope, kept)
     assert not robot.store.path.exists()
     assert not robot.store.lock.exists()

@@ -186,7 +186,7 @@ def test_what_its_end_means(
     manager: FakeManager,
     scope: Scope,
     clock: list[float],
-    journal: list[dict[str, str]],
+    journal: FakeJournal,
     records: list[dict[str, str]],
     facts: dict[str, object],
     fault: Fault | None,
@@ -195,7 +195,7 @@ def test_what_its_end_means(
     unit = manager.add(options(), "inactive", InvocationID=b"")
     gate = Gate(manager, scope, options(), lambda _: None)
     manager.units[unit] |= facts
-    journal += records
+    journal.write(*records)
     assert gate._wait_ready(SECOND) == fault
 
 
