@@ -37,7 +37,9 @@ subprocess.Popen(["sleep", "1000"])
 """
 
 
-def test_node_groups_have_controllers(cell: Cell, project: Project) -> None:
+def test_node_groups_have_controllers_and_messages_shared_memory(
+    cell: Cell, project: Project
+) -> None:
     cell.start(project.three_nodes())
     for node in ("source", "doubler", "sink"):
         group = cell.group / f"node-{node}"
@@ -48,10 +50,6 @@ def test_node_groups_have_controllers(cell: Cell, project: Project) -> None:
     assert not [
         line for line in rows.splitlines() if line.startswith("sink") and " - " in line[:50]
     ]
-
-
-def test_messages_go_through_shared_memory(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
     cell.wait_exchanging()
     assert not [one for one in cell.journal() if "shm segment" in str(one["MESSAGE"])]
 
