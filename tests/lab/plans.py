@@ -49,13 +49,19 @@ def plan_test(form: str) -> list[Step]:
     if form == "host":
         return [*plan_unit(form), *plan_system(form)]
     (unit,) = plan_unit(form)
-    build, inside = build_step(), limits_step()
+    build, inside, several = build_step(), limits_step(), machines_step()
+    queue = [replace(one, after=(unit.name,)) for one in plan_system("container")]
+    inside = replace(inside, after=(unit.name,))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
-    installed = replace(packages_step(), after=(build.name,))
-    beside = [build, inside, *plan_lab(form), *plan_other_python(form), *plan_system("container")]
-    several = replace(machines_step(), after=(installed.name,))
-    beside = [replace(one, after=(unit.name,)) for one in beside]
-    return [unit, *beside, installed, restarted, several]
+    # One lane beside the machine and the queue: two cores have no time for more.
+    lane = [build, packages_step(), several, *plan_lab(form), *plan_other_python(form)]
+    return [unit, *in_a_row(lane, unit), inside, restarted, *queue]
+
+
+def in_a_row(steps: Sequence[Step], first: Step) -> list[Step]:
+    """The steps one after the other, from the end of `first` on."""
+    before = [first, *steps]
+    return [replace(one, after=(last.name,)) for last, one in zip(before, steps, strict=False)]
 
 
 def in_venv(for_system_tests: bool = False) -> dict[str, str]:

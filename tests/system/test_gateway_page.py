@@ -89,7 +89,7 @@ def test_buttons(browser: Browser, cell: Cell, project: Project) -> None:
     browser.wait_js("document.querySelector('#confirm').open")
     browser.picture("confirm")
     browser.click("#confirmed")
-    browser.wait_text("#said", "Node sink")
+    browser.wait_text("#said", "Node restarting: sink")
     assert cell.pids("node-sink") != [pid] or wait_for(
         "the node is another one", lambda: cell.pids("node-sink") not in ([pid], [])
     )

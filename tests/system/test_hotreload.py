@@ -287,6 +287,8 @@ def test_switched_on_while_it_runs(cell: Cell, project: Project) -> None:
     assert len([e for e, _ in cell.events() if e == "files-changed"]) == 3
 
 
+# A save that comes while dora is about to start the node of the save before is taken up again.
+@pytest.mark.warns("no running node `sink` to replace")
 def test_a_thousand_saves_end_in_the_last_version(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes(), HOT)
     began = time.monotonic()
@@ -419,5 +421,5 @@ def test_a_python_operator_reads_its_file_again(cell: Cell, project: Project) ->
     save(project.root / "op.py", OPERATOR.replace("2 *", "-1 *"))
     (record,) = wait_reloads(cell, 1)
     assert "was reloaded in place: op.py" in record["MESSAGE"]
-    wait_for("the new code", lambda: cell.messages("sink")[-1].startswith("got [-"))
+    wait_for("the new code", lambda: "got [-" in "".join(cell.messages("sink")[-1:]))
     assert pids(cell) == before

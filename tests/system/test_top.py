@@ -129,7 +129,7 @@ def test_keys_restart_and_stop(cell: Cell, project: Project, tmux: Tmux) -> None
     tmux.press("n")
     tmux.wait("q quit")
     tmux.press("R", "y")
-    tmux.wait(f"Node doubler of {cell.name}: restart begun")
+    tmux.wait("Node restarting: doubler")
     wait_for("another process", lambda: pid() not in (0, before))
     tmux.press("Home", "R", "y")
     tmux.wait("Dataflow restarted: ", seconds=60)

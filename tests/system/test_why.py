@@ -156,14 +156,19 @@ def test_systemd_restarts_it_and_gives_it_up(cell: Cell, project: Project) -> No
     assert "systemd has stopped restarting it" in found["remedies"][-1]
 
 
+def is_back(cell: Cell) -> bool:
+    """Whether systemd has restarted it once, and it is ready again."""
+    return (cell.show("NRestarts"), cell.show("ActiveState")) == ("1", "active")
+
+
 @pytest.mark.warns(*KILLED, "watchdog", "Watchdog", "Killing process", "SIGABRT", "core-dump")
 def test_a_runner_that_hung(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes(), "--property", "WatchdogSec=2s")
     os.kill(cell.supervisor_pid("runner"), signal.SIGSTOP)
-    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed", 60)
-    found = verdict(cell)
-    assert (found["cause"], found["is_failure"]) == ("watchdog", True)
-    assert found["summary"] == "the supervisor process hung and was killed by the watchdog"
+    # Whatever the policy says: the nodes have done nothing wrong.
+    wait_for("it runs again", lambda: is_back(cell), 60)
+    text = cell.doractl("why", cell.name).stdout
+    assert "the supervisor process hung and was killed by the watchdog" in text
 
 
 @pytest.mark.warns("not ready within", "Failed with result", "exited", "failed", "Failed to start")

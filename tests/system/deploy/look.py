@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from dora_systemd.adapters.releases.store import HISTORY
 from dora_systemd.names import is_release_id
 from tests.system.cells import Cell, command_line, wait_for
 from tests.system.releases import ETC, STORE, Releases, differences
@@ -98,6 +99,8 @@ def _is_settled(cell: Cell) -> bool:
 def _left(releases: Releases) -> Iterator[Path]:
     unit = releases.cell.unit
     for one in releases.path.iterdir():
+        if one.name == HISTORY:
+            continue
         if one.name.startswith(".") or not (one / "unit").exists():
             yield one
     for place in (ETC, releases.trial.parent):

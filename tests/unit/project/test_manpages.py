@@ -33,6 +33,13 @@ def sections(page: str) -> dict[str, str]:
     return dict(zip(found[1::2], found[2::2], strict=True))
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_lines_of_the_source_fit_80_columns(page: Path) -> None:
+    """mandoc and lintian ask for it; examples are as wide as what they show."""
+    text = re.sub(r"^\.Bd -literal.*?^\.Ed$", "", page.read_text(), flags=re.M | re.S)
+    assert [line for line in text.splitlines() if len(line) > 80 and line[0] != "."] == []
+
+
 def documented_options(source: str) -> set[str]:
     """What stands behind Fl in the items of a list."""
     items = re.findall(r"^\.It (Fl .+)$", source, flags=re.M)

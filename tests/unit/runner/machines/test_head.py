@@ -100,7 +100,15 @@ async def settle() -> None:
         await asyncio.sleep(0)
 
 
-def run(root: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **options: Any) -> None:
+Work = Callable[[], Coroutine[Any, Any, None]]
+
+
+def run(
+    root: Path,
+    work: Callable[[Bench], Coroutine[Any, Any, None]],
+    on: Callable[[Work], None] = live,
+    **options: Any,
+) -> None:
     async def on_loop() -> None:
         bench = Bench(root, **options)
         try:
@@ -108,7 +116,12 @@ def run(root: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **option
         finally:
             bench.dialogue.cancel()
 
-    live(on_loop)
+    on(on_loop)
+
+
+def with_threads(work: Work) -> None:
+    """Run `work` on a usual loop: files are read in a thread, and an impatient one has no time."""
+    asyncio.run(work())
 
 
 def test_it_goes_on_when_all_have_joined(tmp_path: Path) -> None:
@@ -335,4 +348,4 @@ def test_a_member_with_another_file_is_named(tmp_path: Path) -> None:
         assert bench.heard(life.ReloadNoted) == [life.ReloadNoted(0, notice)]
         assert bench.pipes.reasons("machine-differs") == [notice]
 
-    run(tmp_path, work, dataflow=str(tmp_path / "flow.yml"))
+    run(tmp_path, work, with_threads, dataflow=str(tmp_path / "flow.yml"))
