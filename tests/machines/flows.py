@@ -61,7 +61,7 @@ class Flow:
         """The same files on all machines."""
         self.write()
         for machine in self.members.values():
-            there(machine, "mkdir", "-p", PLACE)
+            there(machine, f"rm -rf {PLACE}; mkdir -p {PLACE}")
             command = ["scp", "-q", "-r", PLACE, f"root@{machine}:/opt"]
             subprocess.run(command, check=True)
 

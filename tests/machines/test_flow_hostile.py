@@ -49,7 +49,7 @@ def open_sshd() -> Iterator[None]:
     wait_up("b")
 
 
-@pytest.mark.warns(*LOST)
+@pytest.mark.warns(*LOST, "runs another doubler.py than the one here")
 def test_a_port_of_a_lost_link_is_a_trap(flow: Flow) -> None:
     """dora's daemon looks for its coordinator again, after 5 s, and shows it the token."""
     there("b", f"sed -i '1i {_STUBBORN}' {PLACE}/doubler.py")
