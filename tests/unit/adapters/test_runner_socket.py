@@ -149,6 +149,7 @@ def runner(path: Path, coordinator: Coordinator | None) -> Iterator[None]:
     def run() -> None:
         with pytest.raises(asyncio.CancelledError):
             loop.run_until_complete(task)
+        loop.run_until_complete(end_talks())
         loop.run_until_complete(loop.shutdown_asyncgens())
 
     thread = threading.Thread(target=run)
@@ -162,6 +163,14 @@ def runner(path: Path, coordinator: Coordinator | None) -> Iterator[None]:
         thread.join(20)
         loop.close()
         path.unlink(missing_ok=True)  # Python 3.13 does it by itself
+
+
+async def end_talks() -> None:
+    """End what is still connected: else its sockets are closed at some time, in another test."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for one in others:
+        one.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
 
 
 def is_listening(path: Path) -> bool:
