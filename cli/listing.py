@@ -28,6 +28,9 @@ _FLAGS: dict[str, dict[str, Any]] = {
 }
 """What click makes of the options of `list`; test_command.py compares the two."""
 
+GATEWAY = "dora-gateway.service"
+"""Runs in the slice of the dataflows, and is none."""
+
 _MORE = "Why: doractl why NAME; all runs: doractl logs NAME --run ALL"
 """Below a table with ended dataflows, for a person."""
 
@@ -193,7 +196,7 @@ def _print_nothing(request: ListRequest) -> None:
     from dora_systemd.adapters.cgroup.groups import count_units
 
     with suppress(DoraSystemdError):
-        if count := count_units(SLICE):
+        if count := count_units(SLICE, GATEWAY):
             print(f"In system scope: {count} (doractl list --system)")
 
 

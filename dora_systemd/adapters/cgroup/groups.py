@@ -92,9 +92,10 @@ def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
     return _by_node(path, sorted(found)[:MAX_GROUPS])
 
 
-def count_units(slice_name: str) -> int:
-    """Count the unit groups of a top-level slice of the system manager, 0 if it has none."""
-    return sum(one.endswith(UNIT_SUFFIX) for one in _names(group_path(f"/{slice_name}")))
+def count_units(slice_name: str, besides: str) -> int:
+    """Count the services in a top-level slice of the system manager, without the one `besides`."""
+    names = _names(group_path(f"/{slice_name}"))
+    return sum(one.endswith(UNIT_SUFFIX) and one != besides for one in names)
 
 
 def _names(path: Path) -> Iterator[str]:
