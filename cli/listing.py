@@ -28,9 +28,6 @@ _FLAGS: dict[str, dict[str, Any]] = {
 }
 """What click makes of the options of `list`; test_command.py compares the two."""
 
-GATEWAY = "dora-gateway.service"
-"""Runs in the slice of the dataflows, and is none."""
-
 _MORE = "Why: doractl why NAME; all runs: doractl logs NAME --run ALL"
 """Below a table with ended dataflows, for a person."""
 
@@ -194,9 +191,10 @@ def _print_nothing(request: ListRequest) -> None:
         return
     # Imported late: most lists have a row.
     from dora_systemd.adapters.cgroup.groups import count_units
+    from dora_systemd.decisions.gateway.place import SERVICE_UNIT
 
     with suppress(DoraSystemdError):
-        if count := count_units(SLICE, GATEWAY):
+        if count := count_units(SLICE, SERVICE_UNIT):
             print(f"In system scope: {count} (doractl list --system)")
 
 

@@ -26,7 +26,7 @@ LATE = {
             *("verbs.list", "verbs.facts.ended", "verbs.facts.list"),
             *("decisions.views.details", "decisions.views.objects"),
             *("decisions.views.selection", "cli.colors", "verbs.facts.selector"),
-            "adapters.cgroup.groups",
+            *("adapters.cgroup.groups", "decisions.gateway.place"),
         },
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
