@@ -46,8 +46,9 @@ for event in node:
 """
 # An emulated processor has little to spare for how often a test asks and how often a node sends.
 IS_EMULATED = os.environ.get("LAB") == "vm"
-TICK = f"dora/timer/millis/{250 if IS_EMULATED else 20}"
+TICK = f"dora/timer/millis/{250 if IS_EMULATED else 50}"
 POLL_SECONDS = 0.5 if IS_EMULATED else 0.02
+LONGEST_POLL_SECONDS = 1.0 if IS_EMULATED else 0.2
 THREE_NODES = f"""
 nodes:
   - id: source
@@ -66,12 +67,14 @@ nodes:
 
 def wait_for(what: str, condition: Callable[[], T], seconds: float = 30.0) -> T:
     """What `condition` gives as soon as that is true; fails after `seconds` of an idle machine."""
-    begun = time.monotonic()
+    begun, pause = time.monotonic(), POLL_SECONDS
     while not (value := condition()):
         waited = time.monotonic() - begun
         is_over = waited > seconds and waited > bound(seconds)
         assert not is_over, f"not within {seconds} s, {pace():.1f} times that here: {what}"
-        time.sleep(POLL_SECONDS)
+        time.sleep(pause)
+        # What takes long is polled less often: a poll can be a process.
+        pause = max(POLL_SECONDS, min(waited / 10, LONGEST_POLL_SECONDS))
     return value
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import TICK, Cell, Project, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
 from tests.system.pages import CONTRAST, node
@@ -48,7 +48,7 @@ def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
     drawn = "[...document.querySelectorAll('.graph {}')].map((e) => e.textContent)"
     assert len(browser.wait_js(drawn.format(".box"))) == 3
     assert set(browser.js(drawn.format(".edge title"))) == {
-        "dora/timer/millis/20 → source: tick",
+        f"{TICK} → source: tick",
         "source → doubler: number",
         "doubler → sink: double",
     }

@@ -12,7 +12,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import table_rows
-from tests.system.cells import Cell, Project, is_alive, run, wait_for
+from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.test_enable import boots
 
 __all__ = ["boots"]

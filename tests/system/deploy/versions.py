@@ -16,20 +16,13 @@ nodes:
   - {id: a, path: a.py, inputs: {t: dora/timer/millis/50}, outputs: [image]}
   - {id: b, path: b.py, inputs: {image: a/image, t: dora/timer/secs/1}}
 """
-LEAK = f"""{READY}
-import time
-hoard = []
-while True:
-    hoard.append(b"x" * (4 << 20))
-    time.sleep(0.05)
-"""
 
 
 class Version(NamedTuple):
     """A bad version. files: of the project, by name; what is not named is as in the good one.
 
     says: what deploy prints. flags: of deploy. why: what `why` says of it, "" for what has never
-    run. status: of deploy. needs_limits: of memory.
+    run. status: of deploy.
     """
 
     files: Mapping[str, str]
@@ -37,7 +30,6 @@ class Version(NamedTuple):
     flags: tuple[str, ...] = ("--soak", "20s")
     why: str = ""
     status: ExitCode = ExitCode.ROLLED_BACK
-    needs_limits: bool = False
 
 
 def refused(flow: str, says: str) -> Version:
@@ -81,13 +73,6 @@ BAD = {
         {"dataflow.systemd.yml": "nodes: {a: {needs: [/dev/video99]}}\n"},
         "node a: waits for /dev/video99 (not there)",
         why="node a: waits for /dev/video99 (not there)",
-    ),
-    "leak": Version(
-        {"a.py": LEAK},
-        "node a: out of memory",
-        ("--soak", "60s", "--node-limit", "a:memory=200M,swap=0"),
-        why="node a: out of memory",
-        needs_limits=True,
     ),
     "missing-program": refused("nodes: [{id: a, path: gone.py}]\n", "gone.py"),
     "dora-refuses": refused(FLOW.replace("inputs", "unknown: 3, inputs"), "unknown field"),

@@ -56,6 +56,8 @@ def wait_waiting(cell: Cell, node: str, path: Path | str) -> dict[str, Any]:
     """Return when the node waits for `path`, and its launcher is the only process of it."""
 
     def waits() -> dict[str, Any] | None:
+        if not cell.status.nodes[node].needs:
+            return None
         one = node_of(cell, node)
         is_so = one["state"] == "waiting" and str(path) in (one["waits_for"] or "")
         pids = cell.pids(f"node-{node}")
@@ -68,7 +70,7 @@ def wait_waiting(cell: Cell, node: str, path: Path | str) -> dict[str, Any]:
 
 def wait_running(cell: Cell) -> None:
     """Return when all nodes run."""
-    wait_for("all nodes run", lambda: seen(cell)["status"] == "Running" and _all_alive(cell))
+    wait_for("all nodes run", lambda: _all_alive(cell) and seen(cell)["status"] == "Running")
 
 
 def _all_alive(cell: Cell) -> bool:

@@ -30,6 +30,13 @@ def test_a_hang_has_words() -> None:
         assert find_fault([one], "") == Fault(f"node a: {words}", "a")
 
 
+def test_a_leak_has_its_limit() -> None:
+    """As the runner reports it, see test_a_node_over_its_limit_is_killed_alone on a real kernel."""
+    exit_text = "out of memory, peak 200M, limit 200M"
+    leak = Happening("node-oom", 20, "a", "", "new", details={"exit": exit_text})
+    assert find_fault([leak], "") == Fault(f"node a: {exit_text}", "a")
+
+
 def test_a_dataflow_may_finish() -> None:
     finished, stopped = Happening("dataflow-finished", 20), Happening("dataflow-stopped", 30)
     assert is_finished([finished])
