@@ -64,6 +64,13 @@ _DEPLOY_BROKEN = (
     'echo "raise SystemExit(1)" >"$place/broken/node.py"; '
     f'doractl deploy -q "$place/broken/dataflow.yml" {_FLAGS} --soak 1s'
 )
+# As a release by hand does it: another directory has the name, and its files have other contents.
+_SWAP = (
+    'rm -rf "$place/next"; cp -a "$place/project" "$place/next" || exit 3; '
+    'echo "# edited" >>"$place/next/node.py"; '
+    'mv "$place/project" "$place/before" || exit 3; '
+    'mv "$place/next" "$place/project"; rm -r "$place/before"'
+)
 
 COMMANDS = {
     "start": Command(_START, Wish.RUN, 8, lives=1),
@@ -115,7 +122,8 @@ FAULTS = {
     "kill-source": Fault("hit KILL $(node source)"),
     "kill-sink": Fault("hit KILL $(node sink)"),
     "kill-launcher": Fault("hit KILL $(node source) && hit KILL $(launcher)"),
-    "kill-unit": Fault("systemctl kill --signal=KILL $unit", kills_runner=True),
+    "kill-unit": Fault("is_frozen && exit 3; systemctl kill -s KILL $unit", kills_runner=True),
+    "freeze-unit": Fault("systemctl freeze $unit || exit 3", "thaw_unit"),
     "kill-doractl": Fault("hit KILL $(pgrep -x doractl)", weight=0),
     "kill-gateway": Fault("hit KILL $(main_pid dora-gateway.service)"),
     "stop-runner": Fault("hit STOP $(part runner)", "thaw", kills_runner=True),
@@ -142,6 +150,7 @@ FAULTS = {
     "project-deleted": Fault(
         'mv "$place/project" "$place/deleted"', 'mv "$place/deleted" "$place/project"'
     ),
+    "project-swapped": Fault(_SWAP),
     "project-read-only": Fault(
         'mount --bind "$place/project" "$place/project"'
         ' && mount -o remount,bind,ro "$place/project"',

@@ -70,7 +70,7 @@ def wait_waiting(cell: Cell, node: str, path: Path | str) -> dict[str, Any]:
 
 def wait_running(cell: Cell) -> None:
     """Return when all nodes run."""
-    wait_for("all nodes run", lambda: _all_alive(cell) and seen(cell)["status"] == "Running")
+    wait_for("all nodes run", lambda: seen(cell)["status"] == "Running" and _all_alive(cell))
 
 
 def _all_alive(cell: Cell) -> bool:
