@@ -17,7 +17,10 @@ from tests.system.ports import reserve_ports
 from tests.system.releases import Releases
 from tests.system.work_queue import longest_first, run_queue
 
-LONGEST = ()
+LONGEST = (
+    *("test_fidelity_exit", "test_restarts", "test_history", "test_transcripts"),
+    *("test_faults", "test_gateway", "test_remote"),
+)
 """Modules that take longest, which a queue begins with."""
 
 LONGEST_SECONDS = 300
