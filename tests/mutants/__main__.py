@@ -119,6 +119,7 @@ def call_mutmut(tree: Path, names: Sequence[str]) -> None:
         "PYTHONPATH": f"{tree}/mutants",
         "PYTHONPYCACHEPREFIX": f"{tree}/pycache",
         "HYPOTHESIS_STORAGE_DIRECTORY": f"{tree}/hypothesis",
+        "PYTEST_ADDOPTS": f"-o cache_dir={tree}/pytest",  # all else is read-only
     }
     with (tree / "mutmut.log").open("w") as log:
         command = ["nice", "-n", "15", *_APART, "sh", "-c", _INSIDE, "sh", *names]
