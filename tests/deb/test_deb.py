@@ -102,6 +102,12 @@ def test_install(before: set[str]) -> None:
     assert not any("dist-packages/dora_cli" in path for path in packages.files() - before)
 
 
+def test_a_module_of_the_same_name_changes_nothing(tmp_path: Path) -> None:
+    for name in ("click", "yaml", "dora_systemd", "re"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('not that one')\n")
+    sh(f"cd {tmp_path} && PYTHONPATH={tmp_path} PYTHONSTARTUP=click.py doractl list --all")
+
+
 def test_versions_of_what_is_installed() -> None:
     versions = json.loads(sh("doractl version -o json").stdout)
     assert versions["dora"] == "1.1.0"
