@@ -233,7 +233,8 @@ def test_restarts_have_one_meaning(cell: Cell, project: Project) -> None:
     )
     crash(cell, project, *words)
     assert listed(cell, "--all")[cell.name]["restarts"] == int(cell.show("NRestarts")) == 0
-    assert "\nRestarts: 0\n" in cell.doractl("list", cell.name, check=False).stdout
+    whose = "0 of the dataflow by systemd"
+    assert f"\nRestarts: {whose}\n" in cell.doractl("list", cell.name, check=False).stdout
     assert "Restarts: bad 1 (exit code 3)\n" in cell.doractl("why", cell.name).stdout
 
 

@@ -106,7 +106,8 @@ def test_the_budget_is_seen_used_up_and_reset(cell: Cell, project: Project) -> N
     budget = wait_for("it is counted", lambda: used_budget(cell))
     assert (budget["used"], budget["max"]) == (1, 1)
     assert 0 < budget["resets_us"] <= 300 * SECOND
-    assert "Budget:   1/1 restarts used, resets in " in cell.doractl("list", cell.name).stdout
+    spent = "Budget:   1/1 restarts of the dataflow used, resets in "
+    assert spent in cell.doractl("list", cell.name).stdout
 
     done = cell.doractl("reset", cell.name)
     assert done.stdout.endswith(f"({cell.name}, restart counter reset, was 1)\n")

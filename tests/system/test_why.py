@@ -87,11 +87,21 @@ def test_a_failed_start_shows_the_words_of_the_guilty_node(cell: Cell, project: 
     camera = 'import sys\nprint("no camera there", file=sys.stderr, flush=True)\nsys.exit(3)\n'
     project.write("bad.py", camera)
     project.write("taker.py", TAKER)
-    done = cell.start(project.write("flow.yml", BAD), check=False)
+    flow = project.write("flow.yml", BAD)
+    done = cell.start(flow, check=False)
     assert done.returncode == ExitCode.FAILURE
     *words, message, _ = done.stderr.splitlines()
     assert words == ["  bad: no camera there"]
     assert message.startswith(f"doractl: cannot start {cell.name}: node bad: exit code 3")
+    # One that only prepares something ends the others as well, and says nothing.
+    project.write("bad.py", "import time\ntime.sleep(0.3)\n")
+    done = cell.start(flow, check=False)
+    early = "node bad: exit code 0 before it called dora"
+    assert done.stderr.splitlines()[-2].startswith(f"doractl: cannot start {cell.name}: {early}, ")
+    found = verdict(cell)
+    assert (found["node"], found["summary"]) == ("bad", early)
+    assert "dataflow-started" not in [one["event"] for one in found["timeline"]]
+    assert found["remedies"][0].startswith("have bad call Node() and keep running, or take bad out")
 
 
 @pytest.mark.warns(*CRASHES)

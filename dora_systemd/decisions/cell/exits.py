@@ -77,6 +77,8 @@ def exit_of(status: int) -> Exit:
 
 
 KILLED = exit_of(-signal.SIGKILL)
+EARLY = Exit(ExitKind.CODE, 0, " before it called dora")
+"""A node that never called Node(): dora then fails the nodes that wait for it at the start."""
 
 
 def parse_exit(text: str) -> Exit:

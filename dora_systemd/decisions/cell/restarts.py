@@ -158,8 +158,11 @@ def check_restart_nodes(
 
 
 def budget_words(budget: Mapping[str, int | None]) -> str:
-    """Such as "3/5 restarts used, next try in 40s, resets in 8min"; times in whole seconds."""
-    parts = [f"{budget['used']}/{budget['max']} restarts used"]
+    """Such as "3/5 restarts of the dataflow used, next try in 40s, resets in 8min".
+
+    Times are in whole seconds.
+    """
+    parts = [f"{budget['used']}/{budget['max']} restarts of the dataflow used"]
     for key, words in (("next_us", "next try in"), ("resets_us", "resets in")):
         left = budget[key]
         if left is not None:

@@ -16,6 +16,7 @@ from dataclasses import replace
 from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.exits import parse_exit
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
+from dora_systemd.decisions.life import early
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
 from dora_systemd.decisions.life.causes import Cause
@@ -66,9 +67,9 @@ def subscribed(cell: Cell, event: life.Event) -> Next:
 
 def barrier_opened(cell: Cell, event: life.Event) -> Next:
     """Dora opened its start barrier: the dataflow runs, unless a node failed before."""
-    # Dora also opens the barrier after a node failed before it was ready, and then ends the other
+    # Dora also opens the barrier after a node ended before it was ready, and then fails the other
     # nodes: RunFinished follows. If it does not follow within CASCADE_TIMEOUT, the dataflow runs.
-    if any(node.state == "failed" for node in cell.nodes.values()):
+    if any(node.state == "failed" for node in cell.nodes.values()) or early.is_doomed(cell):
         return cell, (Deadline(CASCADE_TIMEOUT),)
     return run(cell, event)
 
@@ -195,7 +196,10 @@ def node_event_waiting(cell: Cell, event: life.NodeExited) -> Next:
     A node with the policy HELD waits for a reload after it failed. That is no help while the start
     can still fail: on the first run, and in a trial, where the version before can come back.
     """
-    after, actions = node_event(cell, event)
+    event = early.with_cause(cell, event)
+    blamed, records = early.blamed(cell, event)
+    after, actions = node_event(blamed, event)
+    after, actions = early.noted(cell, after, event.node), (*records, *actions)
     node = after.nodes[event.node]
     if node.state == "failed" and node.policy == LATCHED:
         return _fail_early(after, event.node, actions)
@@ -218,6 +222,7 @@ def run_finished(cell: Cell, event: life.Event) -> Next:
 
 def result(cell: Cell, event: life.ResultKnown) -> Next:
     """The results of the nodes decide between a finished and a failed dataflow."""
+    event = replace(event, results=early.blamed_results(event.results))
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
         lost = because(cell, Cause.NO_ANSWER)

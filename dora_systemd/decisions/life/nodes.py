@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.asked import STOP, is_stopped, was_asked
-from dora_systemd.decisions.cell.exits import KILLED, Exit, ExitKind
+from dora_systemd.decisions.cell.exits import EARLY, KILLED, Exit, ExitKind
 from dora_systemd.decisions.cell.owed import RESTART
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
 from dora_systemd.decisions.descriptor.wiring import Downstream
@@ -333,7 +333,8 @@ def spent(nodes: NodeTable) -> dict[str, str]:
 
 def _is_spent(node: NodeStatus) -> bool:
     if node.state == "failed":
-        return node.policy not in ("never", HELD, LATCHED) and not node.exit.by
+        is_own = not node.exit.by and node.exit != EARLY
+        return is_own and node.policy not in ("never", HELD, LATCHED)
     is_used_up = 0 < node.max_restarts <= node.restarts
     return node.state == "finished" and node.policy == "always" and is_used_up
 

@@ -92,7 +92,7 @@ class Cell:
     what it needs, CLOCK_REALTIME µs. machine: the name of this machine if it is a member. members:
     the other machines, if it is the head. awaited: which of them is not there, and why. lost: those
     that had joined and were lost. waits_for_lost: whether the loss of a machine leads to another
-    run in this process.
+    run in this process. early: the nodes that have ended for good before they had called dora.
     """
 
     grace: int
@@ -119,3 +119,4 @@ class Cell:
     awaited: str = ""
     lost: frozenset[str] = frozenset()
     waits_for_lost: bool = False
+    early: tuple[str, ...] = ()

@@ -90,7 +90,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("Nodes", row.problem),
         ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),
-        ("Restarts", format_count(row.restarts)),
+        ("Restarts", _restart_words(row)),
         ("Stopped", format_stopped({one.node: one.stopped_by for one in row.nodes})),
         ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),
         ("Inhibit", format_holders(row.inhibitors) if row.inhibitors else ""),
@@ -103,6 +103,13 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
     if not row.nodes:
         return "\n".join(lines)
     return "\n".join([*lines, "", _format_nodes(row.nodes, width, want_colors)])
+
+
+def _restart_words(row: DataflowRow) -> str:
+    """Whose restarts are which: systemd restarts the dataflow, dora restarts single nodes."""
+    whole = f"{format_count(row.restarts)} of the dataflow by systemd"
+    counts = [one.restarts for one in row.nodes if one.restarts is not None]
+    return f"{whole}, {sum(counts)} of single nodes by dora" if counts else whole
 
 
 def _status_words(row: DataflowRow) -> str:

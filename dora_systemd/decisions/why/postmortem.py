@@ -3,7 +3,7 @@
 If the cause is not recorded, the verdict says so; it never guesses.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.asked import RESTART
@@ -108,8 +108,9 @@ def _present(life: Life, facts: Facts) -> Verdict:
     gone = [one for one in final_crashes(life) if one.node in facts.failed]
     if gone:
         # The live table has the number of restarts.
-        first, how = gone[0].node, facts.failed[gone[0].node]
-        return replace(_crash(gone[0]), summary=f"node {first}: {how}")
+        first, *others = _own(gone, facts.failed)
+        summary = f"node {first.node}: {facts.failed[first.node]}"
+        return _with_others(replace(_crash(first), summary=summary), others, facts.failed)
     waiting = [one for one in final_crashes(life) if one.node in facts.restarting]
     if waiting:
         return replace(_crash(waiting[-1]), is_passing=True)
@@ -171,22 +172,52 @@ def _failure(life: Life, end: Happening) -> Verdict:
     named = end.detail("nodes").split()
     crashes = [one for one in final_crashes(life) if not named or one.node in named]
     cause = _cause_of(life, end)
+    ends = _ends(reason, named)
     if cause is Cause.NODE_FAILED and crashes:
-        found = _crash(crashes[0])
+        first, *others = _own(crashes, ends)
+        found = _crash(first)
         if reason.startswith(ESSENTIAL):
             return replace(found, summary=reason)
-        return replace(found, summary=_with_tail(found, reason))
+        summary = _with_tail(found.summary, ends.get(first.node, ""))
+        return _with_others(replace(found, summary=summary), others, ends)
     node = named[0] if named else ""
     lost = life.last(*_LOSSES)
     return _found(cause, reason, lost if cause in _LOSSES and lost else end, node)
 
 
-def _with_tail(found: Verdict, reason: str) -> str:
-    """The runner's own text for that node, which has the number of restarts."""
-    parts = [one for one in reason.split(", node ") if one.removeprefix("node ")]
-    own = [one for one in parts if one.removeprefix("node ").startswith(f"{found.node}: ")]
-    _, after, count = own[0].rpartition(" after ") if own else ("", "", "")
-    return found.summary + (after + count if count.endswith(("restart", "restarts")) else "")
+def _ends(reason: str, named: Sequence[str]) -> dict[str, str]:
+    """By node how it ended, from the reason of a failed dataflow."""
+    parts = (one.partition(": ") for one in f", {reason}".split(", node "))
+    return {node: how for node, _, how in parts if node in named}
+
+
+def _own(crashes: Sequence[Happening], ends: Mapping[str, str]) -> Sequence[Happening]:
+    """The crashes that no crash of another node has caused, or all if there are none."""
+    victims = {node for node, how in ends.items() if parse_exit(how).by}
+    own = [
+        one
+        for one in crashes
+        if one.node not in victims and not parse_exit(one.detail("exit")).by
+    ]
+    return own or crashes
+
+
+_MOST_OTHERS = 3
+
+
+def _with_others(found: Verdict, crashes: Sequence[Happening], ends: Mapping[str, str]) -> Verdict:
+    """Add the nodes that failed by themselves after the first one."""
+    texts = [_with_tail(_crash(one).summary, ends.get(one.node, "")) for one in crashes]
+    more = len(texts) - _MOST_OTHERS
+    shown = [*texts[:_MOST_OTHERS], *([f"{more} more"] if more > 0 else [])]
+    summary = "; then ".join((found.summary, *shown))
+    return replace(found, summary=summary, others=tuple(one.node for one in crashes))
+
+
+def _with_tail(summary: str, how: str) -> str:
+    """Add the number of restarts, which only the runner's own text of that end has."""
+    _, after, count = how.rpartition(" after ")
+    return summary + (after + count if count.endswith(("restart", "restarts")) else "")
 
 
 def _cause_of(life: Life, end: Happening) -> Cause:

@@ -3,17 +3,18 @@
 import signal
 from collections.abc import Mapping
 
-from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
+from dora_systemd.decisions.cell.exits import EARLY, ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import FROZEN, WAITING
 from dora_systemd.decisions.why.verdict import Verdict
 
 _BY_HAND = "run: doractl restart {name}"
+AND_RESTART = f", then {_BY_HAND}"
 _AUTOMATIC = f"{_BY_HAND}; --restart-policy on-failure does this automatically"
 _OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
 _MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)"
 _REMEDIES = {
-    Cause.NODE_FAILED: "fix {node}, then run: doractl restart {name}",
+    Cause.NODE_FAILED: f"fix {{node}}{AND_RESTART}",
     Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
     Cause.NODE_WATCHDOG: "find out what {node} waited for (PYTHONFAULTHANDLER=1 prints that for "
     "Python), or raise watchdog: in its settings",
@@ -55,6 +56,10 @@ _SIGNAL_REMEDIES: Mapping[int, str] = {
     ),
 }
 _THAW = "somebody has frozen the unit; run: systemctl {flag} thaw {unit}"
+_CALL_DORA = (
+    "have {node} call Node() and keep running, or take {node} out of {file} (what only prepares "
+    "something is no node), then run: doractl restart {name}"
+)
 _GATHERING = "nothing: it starts when all machines are there; doractl stop {name} gives up"
 
 
@@ -68,6 +73,8 @@ def remedy_of(verdict: Verdict) -> str:
         owner = verdict.details.get("owner", "")
         return _MEMORY_REMEDIES.get(owner, _REMEDIES[verdict.cause])
     exit = parse_exit(verdict.details.get("exit", ""))
+    if exit == EARLY:
+        return _CALL_DORA
     if verdict.cause is Cause.NODE_FAILED and exit.kind is ExitKind.SIGNAL:
         return _SIGNAL_REMEDIES.get(exit.number, _REMEDIES[verdict.cause])
     remedy = _REMEDIES.get(verdict.cause, "")

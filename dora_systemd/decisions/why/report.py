@@ -19,7 +19,7 @@ from dora_systemd.decisions.views.dataflows import (
 from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.decisions.why.last_lines import Word, shown_last
-from dora_systemd.decisions.why.remedies import remedy_of
+from dora_systemd.decisions.why.remedies import AND_RESTART, remedy_of
 from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.names import release_of
@@ -37,8 +37,12 @@ _GIVEN_UP = "systemd has stopped restarting it; doractl restart {name} resets th
 _WAITING = "systemd restarts it automatically; doractl stop {name} prevents that"
 _THERE = "doractl -H {host} why {name} tells what machine {machine} has seen"
 _AGAIN = "nothing: dora restarts {node} automatically"
+_AGAIN_FIXED = "dora restarts {node} automatically, and so finds it fixed"
+_HOPELESS = re.compile(r"(SyntaxError|IndentationError|TabError|ModuleNotFoundError|ImportError)\b")
+"""Begins the last line of a Python program that no restart helps."""
 _FIX_RELEASE = "fix {node}, then run: doractl deploy --name {name}"
-_AWAY = "{node} stays down until doractl restart {name}; the other nodes keep running"
+_OTHERS = "fix {others} as well; doractl logs {name} --node {other} has its last lines"
+_AWAY = "{away} down until doractl restart {name}; the other nodes keep running"
 _HELD = (
     "{node} stays down until its file is saved, which hot reload sees, or until "
     "doractl reload {name} --node {node}; the other nodes keep running"
@@ -88,9 +92,11 @@ def remedies(report: Report) -> list[str]:
     verdict, subject = report.verdict, report.subject
     lines = (one.text for one in report.words)
     hint = known_remedy(lines, report.node) if report.node else ""
-    texts = [_AGAIN if verdict.is_passing else remedy_of(verdict)]
+    texts = _of_passing(report) if verdict.is_passing else [remedy_of(verdict)]
     if report.is_of_trial and report.undone:
         texts = [_FIX_RELEASE] if report.node else []
+    if verdict.others and not report.is_of_trial:
+        texts.append(_OTHERS)
     machine = verdict.details.get("machine", "")
     if host := report.machines.get(machine):
         texts.append(_THERE)
@@ -103,6 +109,9 @@ def remedies(report: Report) -> list[str]:
     values = {
         "name": subject.name,
         "node": report.node or "the node",
+        "others": ", ".join(verdict.others),
+        "other": (*verdict.others, "")[0],
+        "away": _away(verdict),
         "file": subject.file or "FILE",
         "unit": subject.unit,
         "flag": subject.flag,
@@ -124,6 +133,21 @@ def remedies(report: Report) -> list[str]:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"
     return [text.replace(f"doractl restart {subject.name}", again) for text in filled]
+
+
+def _of_passing(report: Report) -> list[str]:
+    """What to do about a node that dora is about to restart: fix it, if it always ends so."""
+    verdict = report.verdict
+    has_helped = not any(one.node == verdict.node for one in verdict.restarts)
+    if has_helped and not any(_HOPELESS.match(one.text) for one in report.words[-1:]):
+        return [_AGAIN]
+    return [remedy_of(verdict).replace(AND_RESTART, ""), _AGAIN_FIXED]
+
+
+def _away(verdict: Verdict) -> str:
+    """As "camera stays", "camera, plot stay"."""
+    verb = "stay" if verdict.others else "stays"
+    return f"{', '.join((verdict.node, *verdict.others))} {verb}"
 
 
 def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:

@@ -49,12 +49,13 @@ class Verdict:
     """What happened to a dataflow.
 
     status: a word of `list`. summary: what ended and how. now: STATUS= of a running one. node: the
-    node that failed first, or "". at_us: time of that; began_us: beginning of that life;
-    CLOCK_REALTIME µs, 0: unknown. invocation: systemd's id of that life. details: other facts about
-    the end. is_given_up: systemd's start limit is reached. is_passing: dora restarts the node.
-    starved: nodes downstream. restarts: those that `list` counts, oldest first. before: how the
-    life before these ended, and when. nodes: of a dataflow that has ended, as its events name
-    them. stopped: nodes of one that is up which somebody has stopped, and who. policy: see Facts.
+    node that failed first, or "". others: those that failed by themselves after it. at_us: time of
+    that; began_us: beginning of that life; CLOCK_REALTIME µs, 0: unknown. invocation: systemd's id
+    of that life. details: other facts about the end. is_given_up: systemd's start limit is reached.
+    is_passing: dora restarts the node. starved: nodes downstream. restarts: those that `list`
+    counts, oldest first. before: how the life before these ended, and when. nodes: of a dataflow
+    that has ended, as its events name them. stopped: nodes of one that is up which somebody has
+    stopped, and who. policy: see Facts.
     """
 
     status: str
@@ -77,6 +78,7 @@ class Verdict:
     nodes: tuple[NodeRow, ...] = ()
     stopped: Mapping[str, str] = field(default_factory=dict)
     policy: str = ""
+    others: tuple[str, ...] = ()
 
     @property
     def is_up(self) -> bool:

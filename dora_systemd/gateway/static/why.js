@@ -32,7 +32,7 @@ function memoryWords(details) {
 function budgetWords(budget) {
   if (!budget?.used) return "";
   const next = budget.next_us == null ? "" : `, the next one in ${span(budget.next_us)}`;
-  return `${budget.used} of ${budget.max} restarts used${next}`;
+  return `${budget.used} of ${budget.max} restarts of the dataflow used${next}`;
 }
 
 const list = (title, className, items) => (items.length

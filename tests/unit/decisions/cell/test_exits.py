@@ -4,12 +4,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.cell.exits import Exit, ExitKind, exit_of, find_exit, parse_exit
+from dora_systemd.decisions.cell.exits import EARLY, Exit, ExitKind, exit_of, find_exit, parse_exit
 
 TEXTS = {
     "": Exit(),
     "exit code 3": Exit(ExitKind.CODE, 3),
     "exit code -1": Exit(ExitKind.CODE, -1),
+    "exit code 0 before it called dora": EARLY,
     "signal SIGKILL": Exit(ExitKind.SIGNAL, 9),
     "signal 35": Exit(ExitKind.SIGNAL, 35),
     "signal SIGKILL after the grace duration": Exit(

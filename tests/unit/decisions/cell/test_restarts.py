@@ -199,7 +199,9 @@ def test_budget(starts: list[int], now: int, counted: int, expected: Budget) -> 
 
 def test_words() -> None:
     budget = {"used": 3, "max": 5, "next_us": 39_100_000, "resets_us": 480 * SECOND}
-    assert budget_words(budget) == "3/5 restarts used, next try in 40s, resets in 8min"
+    assert budget_words(budget) == (
+        "3/5 restarts of the dataflow used, next try in 40s, resets in 8min"
+    )
     assert budget_words({"used": 0, "max": 5, "next_us": None, "resets_us": None}) == (
-        "0/5 restarts used"
+        "0/5 restarts of the dataflow used"
     )

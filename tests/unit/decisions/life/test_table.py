@@ -296,6 +296,62 @@ def test_the_barrier_opens_although_a_node_has_failed() -> None:
     assert Record("dataflow-started") in actions
 
 
+EARLY_END = (
+    *START,
+    life.NodeReady(5, "b"),
+    life.NodeExited(6, "a", Exit(), False),
+    life.AllReady(7),
+)
+
+
+def test_a_node_that_ends_before_it_calls_dora_has_failed_the_others() -> None:
+    now, done = live(
+        *EARLY_END,
+        life.NodeExited(8, "b", exit_of(1), False),
+        life.NodeCascaded(8, "b", "a"),
+        life.RunFinished(10),
+        life.ResultKnown(11, {"a": Exit(), "b": exit_of(1)._replace(by="a")}),
+        life.ChildExited(12, "daemon", exit_of(0)),
+    )
+    assert "dataflow-started" not in [one.event for one in done if isinstance(one, Record)]
+    assert [one for one in done if isinstance(one, Record)][-3:] == [
+        Record("node-crashed", "a", {"exit": "exit code 0 before it called dora"}),
+        Record("node-crashed", "b", {"exit": "exit code 1 because node a failed"}),
+        Record("dataflow-failed", "", {"reason": now.failure, "cause": "node-failed",
+                                       "nodes": "a b"}),
+    ]  # fmt: skip
+    assert now.failure == (
+        "node a: exit code 0 before it called dora, node b: exit code 1 because node a failed"
+    )
+    assert (now.exit, now.nodes["a"].state) == (RunnerExit.FAILED, "failed")
+
+
+@pytest.mark.parametrize("policies", [("on-failure", "on-failure"), ("on-failure", "never")])
+def test_an_early_end_fails_no_start_of_nodes_that_dora_restarts(policies: tuple[str, str]) -> None:
+    now, _ = live(*EARLY_END[:-1])
+    statuses = zip(now.nodes.items(), policies, strict=True)
+    now = replace(now, nodes={key: one._replace(policy=how) for (key, one), how in statuses})
+    after, _ = step(now, EARLY_END[-1])
+    is_doomed = policies[1] == "never"
+    assert after.state is (State.WAITING if is_doomed else State.RUNNING)
+    ended = life.NodeExited(8, "b", exit_of(1), not is_doomed)
+    assert step(after, ended)[0].nodes["a"].state == ("failed" if is_doomed else "finished")
+
+
+def test_a_killed_node_that_was_ready_has_failed_nobody() -> None:
+    ready = (*START, life.NodeReady(5, "a"), life.NodeReady(5, "b"))
+    now, _ = live(*ready, *(life.NodeExited(6, node, exit_of(-9), False) for node in ("a", "b")))
+    assert [str(node.exit) for node in now.nodes.values()] == ["signal SIGKILL"] * 2
+
+
+def test_dora_may_say_only_in_its_result_who_ended_early() -> None:
+    ends = {"a": exit_of(1)._replace(by="b"), "b": Exit()}
+    now, _ = live(*READY, life.RunFinished(10), life.ResultKnown(11, ends))
+    assert now.failure == (
+        "node b: exit code 0 before it called dora, node a: exit code 1 because node b failed"
+    )
+
+
 def test_what_failed_by_itself_is_named_first() -> None:
     """dora reports the nodes in any order."""
     ends = {"a": exit_of(1)._replace(by="b"), "b": exit_of(1)}

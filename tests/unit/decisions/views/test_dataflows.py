@@ -218,7 +218,7 @@ def test_one_dataflow() -> None:
         "Started:  -\n"
         "CPU:      12.5%\n"
         "Memory:   256M\n"
-        "Restarts: 0\n"
+        "Restarts: 0 of the dataflow by systemd, 3 of single nodes by dora\n"
         "At boot:  started\n"
         "\n"
         "NODE      STATE    PID  CPU%   MEM  PEAK  RESTARTS  EXIT\n"
@@ -262,7 +262,10 @@ def test_limits_stand_beside_what_is_used() -> None:
 
 
 def test_one_dataflow_without_nodes() -> None:
-    assert format_dataflow(ROWS[1]).endswith("Restarts: 12\nReason:   doractl why a-longer-name")
+    text = format_dataflow(ROWS[1])
+    assert text.endswith(
+        "Restarts: 12 of the dataflow by systemd\nReason:   doractl why a-longer-name"
+    )
 
 
 def test_json_has_units_in_its_keys() -> None:

@@ -87,7 +87,21 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
     "the first to go is the one": (
         (*RUNS, event("node-crashed", "plot", exit="exit code 9"), CRASH,
          failed("node-failed", "node camera: x, node plot: exit code 9", "camera plot")),
-        *("Failed", Cause.NODE_FAILED, "plot", "node plot: exit code 9"),
+        *("Failed", Cause.NODE_FAILED, "plot"),
+        "node plot: exit code 9; then node camera: exit code 1",
+    ),
+    "what another one has taken along is not the one": (
+        (*RUNS, event("node-crashed", "plot", exit="exit code 1 because node camera failed"), CRASH,
+         failed("node-failed", "node camera: exit code 1, "
+                "node plot: exit code 1 because node camera failed", "camera plot")),
+        *("Failed", Cause.NODE_FAILED, "camera", "node camera: exit code 1"),
+    ),
+    "taken along, and dora has said so only at the end": (
+        (*RUNS, event("node-crashed", "plot", exit="exit code 1"),
+         event("node-crashed", "setup", exit="exit code 0 before it called dora"),
+         failed("node-failed", "node setup: exit code 0 before it called dora, "
+                "node plot: exit code 1 because node setup failed", "setup plot")),
+        *("Failed", Cause.NODE_FAILED, "setup", "node setup: exit code 0 before it called dora"),
     ),
     "signal": (
         (*RUNS, event("node-crashed", "camera", exit="signal SIGSEGV"), NODE_FAILED),
@@ -331,10 +345,37 @@ def test_running_degraded_and_restarting() -> None:
     verdict = judge(*RUNS, CRASH, facts=waiting)
     assert (verdict.node, verdict.is_passing, verdict.is_failure) == ("camera", True, False)
     assert "dora restarts camera automatically" in format_report(Report(SUBJECT, verdict))
+    loop = format_report(Report(SUBJECT, judge(*RUNS, *again, CRASH, facts=waiting)))
+    assert "  fix camera\n  dora restarts camera automatically, and so finds it fixed" in loop
+    said = (Word(1, "camera", "SyntaxError: invalid syntax"),)
+    assert "  fix camera\n" in format_report(Report(SUBJECT, verdict, said))
     facts = Facts("Restarting")
     verdict = judge(*RUNS, failed("daemon-lost", "gone"), unit("unit-restart"), facts=facts)
     assert (verdict.status, verdict.summary) == ("Restarting", "gone")
     assert "systemd restarts it automatically" in format_report(Report(SUBJECT, verdict))
+
+
+def test_two_that_fail_for_different_reasons_have_both_their_names() -> None:
+    crashes = (CRASH, event("node-crashed", "plot", exit="exit code 3"))
+    ends = {"camera": "exit code 1", "plot": "exit code 3 after 1 restart"}
+    down = Facts("Degraded", "1/3", ends)
+    for verdict in (
+        judge(*RUNS, *crashes, facts=down),
+        judge(*RUNS, *crashes, failed("node-failed", "node plot: exit code 3 after 1 restart, "
+                                      "node camera: exit code 1", "plot camera")),
+    ):  # fmt: skip
+        assert (verdict.node, verdict.others) == ("camera", ("plot",))
+        first, second = "node camera: exit code 1", "node plot: exit code 3 after 1 restart"
+        assert verdict.summary == f"{first}; then {second}"
+        text = format_report(Report(SUBJECT, verdict))
+        assert "fix plot as well; doractl logs robot --node plot has its last lines" in text
+    away = judge(*RUNS, *crashes, facts=down)
+    assert "camera, plot stay down until" in format_report(Report(SUBJECT, away))
+    many = [event("node-crashed", f"n{n}", exit="exit code 1") for n in range(9)]
+    reason = ", ".join(f"node n{n}: exit code 1" for n in range(9))
+    nodes = " ".join(f"n{n}" for n in range(9))
+    verdict = judge(*RUNS, *many, failed("node-failed", reason, nodes))
+    assert verdict.summary.endswith("; then node n3: exit code 1; then 5 more")
 
 
 def test_a_restart_that_is_called_off_says_nothing() -> None:
@@ -407,6 +448,7 @@ def test_values_of_fields() -> None:
         ("out of memory: x", "dataflow", "doractl set robot --memory-limit SIZE"),
         ("out of memory: x", "machine", "the machine is short of memory"),
         ("exit code 1", "", "fix camera"),
+        ("exit code 0 before it called dora", "", "have camera call Node()"),
     ],
 )
 def test_remedies(exit: str, owner: str, words: str) -> None:
