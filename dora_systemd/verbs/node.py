@@ -9,7 +9,6 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.runner_socket import client as runner_socket
 from dora_systemd.adapters.runner_socket.client import done_of, order
-from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.decisions.dora.node_command import parse_node_command
 from dora_systemd.decisions.dora.protocol import Params, Reply
@@ -114,9 +113,7 @@ def order_node(
     """
     require_running(cell)
     refuse_parts([cell], CONTROL)
-    if read_status(scope, cell).nodes:
-        require_node(scope, cell, given.node)
-    # Another user cannot read the table: the socket refuses that user.
+    require_node(scope, cell, given.node)
     require_uninhibited(scope, [cell], f"{given.what} node {given.node} of", how, tell)
     by = f"{caller(os.getuid(), os.environ)} ({given.by})"
     request = {"what": given.what, "node": given.node, "by": by, "grace": given.grace}
@@ -201,13 +198,16 @@ def dora_environment(coordinator: Coordinator) -> dict[str, str]:
     return coordinator_variables(coordinator.port, coordinator.token, coordinator.local_listen_port)
 
 
-def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
-    """The live table, which contains `node`. Raises DoraSystemdError (NOT_FOUND) otherwise."""
+def require_node(scope: Scope, cell: Cell, node: str) -> None:
+    """Raise DoraSystemdError (NOT_FOUND) unless the dataflow has this node.
+
+    Without a readable table nobody knows here: the runner's socket refuses another user, and the
+    runner refuses an unknown node.
+    """
     status = read_status(scope, cell)
-    if node not in status.nodes:
+    if status.nodes and node not in status.nodes:
         raise DoraSystemdError(
             f"cannot find a node {quoted(node)} in the dataflow {cell.name}",
-            did_you_mean(node, status.nodes) or f"nodes: {', '.join(status.nodes) or 'none'}",
+            did_you_mean(node, status.nodes) or f"nodes: {', '.join(status.nodes)}",
             ExitCode.NOT_FOUND,
         )
-    return status

@@ -16,6 +16,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs import node
 from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.reload import reload_cell
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.fakes.runner import fake_runner
 
@@ -86,6 +87,18 @@ def test_unknown_node(scope: Scope, cell: Cell) -> None:
         node.order_node(scope, cell, replace(STOP, node="camer"))
     assert caught.value.hint == "did you mean camera?"
     assert caught.value.code is ExitCode.NOT_FOUND
+
+
+def test_who_may_not_read_the_table_is_refused_by_the_socket(scope: Scope, cell: Cell) -> None:
+    (scope.cell_directory("robot") / "status.json").unlink()
+    denied = FakeRunner(DoraSystemdError("permission denied", "", ExitCode.NO_PERMISSION))
+    for door in (
+        lambda: node.order_node(scope, cell, STOP, denied),
+        lambda: reload_cell(scope, cell, "camera", denied),
+    ):
+        with pytest.raises(DoraSystemdError, match="permission denied") as caught:
+            door()
+        assert caught.value.code is ExitCode.NO_PERMISSION
 
 
 def test_a_refusal(scope: Scope, cell: Cell) -> None:
