@@ -53,6 +53,10 @@ class TimedOut(DoraSystemdError):
     """A check took too long. It says nothing of what was checked, so a restart may help."""
 
 
+class RestartsSpent(DoraSystemdError):
+    """The automatic restarts of a dataflow are used up: this one would be one too many."""
+
+
 def words_of(error: Exception) -> str:
     """What an exception says, in the words of errno(3) alone if it has such a number."""
     if isinstance(error, OSError) and error.errno:

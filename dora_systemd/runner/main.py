@@ -50,7 +50,7 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside, say, words
 from dora_systemd.runner.cell.keepalive import Keepalive
 from dora_systemd.runner.cell.life import Life, begin_life, learn_first
-from dora_systemd.runner.cell.pause import forget_restarts, hold_back
+from dora_systemd.runner.cell.pause import find_spent, forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.needs.needs import wait_for_needs
 from dora_systemd.runner.nodes.descriptors import wait_eof
@@ -88,15 +88,19 @@ async def run_cell(
     journal, clock = JournalSocket(), StopClock(options.grace)
     # systemd holds the pipes too, so their content survives a kill of this process.
     this_life = begin_life(options, paths.is_of_user)
+    spent = find_spent(options, paths)
     fd_store.forget_inherited()
     origin = Origin(options.name, options.uuid)
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
     try:
+        if spent:
+            raise spent
         pipes.write_event("dataflow-starting")
         runs = Runs(given, options, paths, pipes, clock, begun, this_life)
         return await live(runs, losses_of_user(journal, pipes) if paths.is_of_user else None)
     except DoraSystemdError as error:
-        tell_failure(pipes, error, Cause.BAD_DATAFLOW)
+        cause = Cause.RESTARTS_SPENT if error is spent else Cause.BAD_DATAFLOW
+        tell_failure(pipes, error, cause)
         raise
     except Exception as error:
         broken = DoraSystemdError(f"cannot run the dataflow: {words(error)}")

@@ -90,6 +90,27 @@ def used_budget(cell: Cell) -> dict[str, int]:
 
 
 @pytest.mark.warns(*KILLED)
+def test_starts_by_hand_use_up_no_restart(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes(), *ON_FAILURE, "--max-restarts", "1", "--no-wait")
+    for _ in range(8):
+        cell.systemctl("restart")
+    assert cell.show("ActiveState") == "active"
+    assert not used_budget(cell)
+    kill(cell, "runner")
+    wait_for("it is restarted", lambda: cell.show("NRestarts") == "1")
+    wait_for("it is up", lambda: cell.show("ActiveState") == "active")
+    kill(cell, "runner")
+    wait_for("it is given up", lambda: cell.show("ActiveState") == "failed")
+    assert cell.show("ExecMainStatus") == "75"
+    words = cell.doractl("why", cell.name, check=False).stdout
+    assert "Why:      the supervisor process was killed (SIGKILL)" in words
+    assert "Restarts: dataflow 1 (the supervisor process was killed (SIGKILL))" in words
+    assert "systemd has stopped restarting it" in words
+    cell.systemctl("start")
+    assert (cell.show("ActiveState"), cell.show("NRestarts")) == ("active", "0")
+
+
+@pytest.mark.warns(*KILLED)
 def test_the_budget_is_seen_used_up_and_reset(cell: Cell, project: Project) -> None:
     words = ("--max-restarts", "1", "--restart-window", "5min")
     cell.start(project.three_nodes(), *ON_FAILURE, *words)
@@ -112,11 +133,9 @@ def test_the_budget_is_seen_used_up_and_reset(cell: Cell, project: Project) -> N
     done = cell.doractl("reset", cell.name)
     assert done.stdout.endswith(f"({cell.name}, restart counter reset, was 1)\n")
     assert cell.show("ActiveState") == "active"
-    # The start of what runs is forgotten, too: there is one restart more.
-    for restarts in ("1", "2"):
-        kill(cell, "runner")
-        wait_for("it is back", lambda number=restarts: cell.show("NRestarts") == number)  # type: ignore[misc]
-        wait_for("it is up", lambda: cell.show("ActiveState") == "active")
+    kill(cell, "runner")
+    wait_for("it is back", lambda: cell.show("NRestarts") == "1")
+    wait_for("it is up", lambda: cell.show("ActiveState") == "active")
     kill(cell, "runner")
     wait_for("it is given up", lambda: cell.show("ActiveState") == "failed")
     assert listed(cell)["status"] == "Failed"

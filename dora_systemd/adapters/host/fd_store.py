@@ -8,11 +8,13 @@ import contextlib
 import os
 import socket
 
+from dora_systemd.decisions.cell.restarts import MOST_COUNTED
+
 PREFIX = "dora-log-"
 """Prefix of the names of pipes; the rest is the node, so that they can be removed by node."""
 LIFE = "dora-life"
 """Name of a descriptor that stands for one life of the runner since the last quiet window."""
-_MOST_LIVES = 64
+_MOST_DIGITS = 32
 _FIRST = 3  # SD_LISTEN_FDS_START, see sd_listen_fds(3)
 
 
@@ -31,21 +33,40 @@ def _forget(name: str) -> None:
 
 
 def lives() -> int:
-    """Number of earlier lives since the last quiet window, at most _MOST_LIVES.
+    """Number of earlier lives since the last quiet window, at most MOST_COUNTED.
 
     systemd keeps these descriptors over restarts, and closes them when the unit is stopped.
     `systemd-analyze fdstore` shows them.
     """
+    return len(_lives())
+
+
+def life_times() -> list[int]:
+    """When the lives began that lives() counts, CLOCK_BOOTTIME µs, oldest first."""
+    return sorted(map(_read_time, _lives()))
+
+
+def _read_time(fd: int) -> int:
+    """The time in the descriptor of a life; 0, which is long ago, if there is none."""
+    with contextlib.suppress(OSError, ValueError):
+        return int(os.pread(fd, _MOST_DIGITS, 0))
+    return 0
+
+
+def _lives() -> list[int]:
+    """The inherited descriptors that stand for a life."""
     if os.environ.get("LISTEN_PID", "") != str(os.getpid()):
-        return 0
-    return os.environ.get("LISTEN_FDNAMES", "").split(":").count(LIFE)
+        return []
+    names = os.environ.get("LISTEN_FDNAMES", "").split(":")
+    return [fd for fd, name in enumerate(names, _FIRST) if name == LIFE]
 
 
-def count_life() -> None:
-    """Count this life."""
-    if lives() < _MOST_LIVES:
+def count_life(began_us: int) -> None:
+    """Count this life. began_us: CLOCK_BOOTTIME."""
+    if lives() < MOST_COUNTED:
         # A new file each time: systemd stores the same file only once.
         fd = os.memfd_create(LIFE, os.MFD_CLOEXEC)
+        os.write(fd, str(began_us).encode())
         _send(f"FDSTORE=1\nFDNAME={LIFE}\nFDPOLL=0", [fd])
         os.close(fd)
 

@@ -24,6 +24,11 @@ holds the nodes back: the sandbox, Python and dora's coordinator are ready by th
 the shortest delay is systemd's own default, for a runner that does not get that far."""
 
 MAX_RESTARTS = 1_000_000
+MOST_COUNTED = 64
+"""Maximum number of restarts that the runner counts. A larger budget is systemd's start limit."""
+_HAND_STARTS = 30
+"""Starts in one window that are no automatic restarts. StartLimitBurst= counts them as well, so it
+is that much larger than the budget, which the runner keeps: see runner/cell/pause.py."""
 _COUNT = re.compile(r"[0-9]{1,9}")
 
 
@@ -62,6 +67,11 @@ class RestartPolicy(NamedTuple):
     def unit_delay(self) -> int:
         """RestartSec= of the unit, in µs."""
         return max(self.delay - HEAD_START, 0)
+
+    @property
+    def unit_burst(self) -> int:
+        """StartLimitBurst=, for which the first start counts too: 3 restarts are four starts."""
+        return self.max_restarts + 1 + (_HAND_STARTS if self.max_restarts < MOST_COUNTED else 0)
 
 
 DEFAULT = RestartPolicy()
@@ -180,11 +190,23 @@ class Budget(NamedTuple):
 def unit_budget(
     starts: Sequence[int], max_restarts: int, window: int, now: int, counted: int
 ) -> Budget:
-    """How much of StartLimitBurst= is used up, as systemd counts it.
+    """How much of the budget is used up.
 
-    starts: CLOCK_REALTIME µs of the starts of the unit, oldest first. counted: NRestarts=, which
-    `doractl reset` clears. systemd's window begins with a start and lasts `window` µs; the next
-    start after its end begins another window.
+    starts: CLOCK_REALTIME µs of the starts of the unit, oldest first: one by hand, and the
+    automatic restarts since. counted: NRestarts=, which `doractl reset` clears.
+    """
+    begin, used = count_restarts(starts, window)
+    if begin is None or now - begin >= window:
+        return Budget(0, None)
+    used = min(used, counted, max_restarts)
+    return Budget(used, begin + window - now if used else None)
+
+
+def count_restarts(starts: Sequence[int], window: int) -> tuple[int | None, int]:
+    """When the last window began, and the restarts in it. starts: as for unit_budget().
+
+    As in systemd, a window begins with a start and lasts `window` µs; the next start after its end
+    begins another window.
     """
     begin, used = None, 0
     for start in starts:
@@ -192,7 +214,4 @@ def unit_budget(
             begin, used = start, 0
         else:
             used += 1
-    if begin is None or now - begin >= window:
-        return Budget(0, None)
-    used = min(used, counted, max_restarts)
-    return Budget(used, begin + window - now if used else None)
+    return begin, used

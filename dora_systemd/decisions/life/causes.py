@@ -25,6 +25,7 @@ class Cause(StrEnum):
     MACHINE_REFUSES = "machine-refuses"
     STOPPED_ON_MACHINE = "stopped-on-machine"
     DIRECTORY_LOST = "directory-lost"
+    RESTARTS_SPENT = "restarts-spent"
     RUNNER_BROKEN = "runner-broken"
     RUNNER_KILLED = "runner-killed"
     WATCHDOG = "watchdog"

@@ -6,7 +6,7 @@ may have another program in the runner's place, so the text is cleaned and cut, 
 
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.life.states import RunnerExit
-from dora_systemd.errors import DoraSystemdError, ExitCode, TimedOut
+from dora_systemd.errors import DoraSystemdError, ExitCode, RestartsSpent, TimedOut
 from dora_systemd.terminal_text import short_line
 
 _HINT = "; hint: "
@@ -27,6 +27,8 @@ def refusal_exit(error: DoraSystemdError) -> RunnerExit:
     """
     if isinstance(error, TimedOut):
         return RunnerExit.FAILED
+    if isinstance(error, RestartsSpent):
+        return RunnerExit.RESTARTS_SPENT
     return next(
         (status for status, code in _CODES.items() if code is error.code), RunnerExit.BAD_DATAFLOW
     )

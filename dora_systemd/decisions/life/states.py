@@ -23,6 +23,7 @@ class RunnerExit(IntEnum):
     FAILED_AT_STOP = 71
     NO_DORA = 72
     STOPPED_ON_MACHINE = 73
+    RESTARTS_SPENT = 75
     NO_ACCESS = 77
     BAD_DATAFLOW = 78
 

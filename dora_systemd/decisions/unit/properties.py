@@ -154,10 +154,7 @@ def stop_properties(options: RunnerOptions) -> dict[str, Property]:
 
 
 def restart_properties(options: RunnerOptions) -> dict[str, Property]:
-    """Automatic restarts, see systemd.service(5) and StartLimitBurst= in systemd.unit(5).
-
-    The first start counts too: "3 restarts" are four starts.
-    """
+    """Automatic restarts, see systemd.service(5) and StartLimitBurst= in systemd.unit(5)."""
     policy = options.restart
     # A restart does not help nodes that dora gave up, or a dataflow that is refused. An attached
     # dataflow that has finished stays finished.
@@ -165,6 +162,7 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     apart = (RunnerExit.NO_MACHINE, RunnerExit.STOPPED_ON_MACHINE) if options.placed else ()
     final = (
         RunnerExit.NODES_FAILED,
+        RunnerExit.RESTARTS_SPENT,
         *refused,
         *apart,
         *(_ENDS_OF_ATTACHED if options.attached else ()),
@@ -183,7 +181,7 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
         # count restarts forever.
         RestartSec=policy.unit_delay,
         StartLimitIntervalSec=0 if is_endless else policy.window,
-        StartLimitBurst=1 if is_endless else policy.max_restarts + 1,
+        StartLimitBurst=1 if is_endless else policy.unit_burst,
     )
 
 

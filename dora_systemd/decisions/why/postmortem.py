@@ -52,7 +52,8 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
     # What is recorded is of earlier lives, as long as systemd has not begun this one.
     chain = [] if facts.is_held else with_restarts(lives)
     life = chain[-1] if chain else Life()
-    if len(chain) > 1 and _says_nothing(life, facts):
+    is_spent = _is_spent(life)
+    if len(chain) > 1 and (is_spent or _says_nothing(life, facts)):
         life = chain[-2]
     status = facts.status if facts.status in UP_WORDS else ended_word(life, facts.status)
     if facts.is_gathering:
@@ -72,9 +73,9 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         now=facts.text if status in UP_WORDS else "",
         began_us=life.began_us,
         invocation=life.invocation,
-        is_given_up=life.last("start-limit") is not None,
+        is_given_up=is_spent or life.last("start-limit") is not None,
         starved=_starved(found, life),
-        restarts=tuple(_counted(restarts_of(chain), life, facts)),
+        restarts=tuple(_counted(_done(restarts_of(chain), is_spent), life, facts)),
         timeline=tuple(one for one in happenings if one.name not in _NO_NEWS),
         before=before.summary,
         before_us=before.at_us,
@@ -82,6 +83,18 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         stopped=facts.stopped,
         policy=facts.policy,
     )
+
+
+def _is_spent(life: Life) -> bool:
+    """Whether the runner has refused this restart: the life before it tells what has failed."""
+    end = life.last("dataflow-failed")
+    return end is not None and end.detail("cause") == Cause.RESTARTS_SPENT
+
+
+def _done(restarts: list[Restart], is_spent: bool) -> list[Restart]:
+    """The restarts without the last one by systemd, if the runner has refused that."""
+    last = max((n for n, one in enumerate(restarts) if one.owner == "systemd"), default=None)
+    return [one for n, one in enumerate(restarts) if not (is_spent and n == last)]
 
 
 def _says_nothing(life: Life, facts: Facts) -> bool:

@@ -34,6 +34,7 @@ _REMEDIES = {
     Cause.MACHINE_REFUSES: "change that on the machine, then run: doractl restart {name}",
     Cause.STOPPED_ON_MACHINE: "run: doractl restart {name}",
     Cause.DIRECTORY_LOST: "run: doractl restart {name}; only systemd may delete files there",
+    Cause.RESTARTS_SPENT: "run: doractl restart {name}",
     Cause.RUNNER_BROKEN: "run: doractl restart {name}; please report it, unless the machine "
     "ran out of processes, files or disk space",
     Cause.RUNNER_KILLED: _AUTOMATIC,

@@ -5,6 +5,9 @@ months apart would lengthen the delay. Therefore RestartSec= is the shortest del
 HEAD_START. The runner waits for the rest: before it does anything else if the delay is longer than
 the shortest, else when it has prepared all that comes before the nodes. systemd keeps the number of
 restarts, see lives() in dora_systemd.adapters.host.fd_store.
+
+StartLimitBurst= counts all starts, also those by hand, so it is only a backstop: the runner counts
+the automatic restarts, and refuses the one that would exceed the budget.
 """
 
 import contextlib
@@ -14,8 +17,8 @@ from pathlib import Path
 
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.restarts import HEAD_START
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.decisions.cell.restarts import HEAD_START, count_restarts
+from dora_systemd.errors import DoraSystemdError, RestartsSpent
 from dora_systemd.names import unit_name
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import INFINITY, SECOND, format_duration
@@ -26,17 +29,42 @@ _MOST_SECONDS = 1.0
 
 
 def pause(options: RunnerOptions, paths: CellPaths) -> None:
-    """Wait for the rest of a long delay; SIGTERM ends the process meanwhile. Raises OSError."""
+    """Wait for the rest of a long delay; SIGTERM ends the process meanwhile.
+
+    Raises OSError, and RestartsSpent if this restart exceeds the budget.
+    """
     policy = options.restart
     if policy.policy == "no":
         return
+    if spent := find_spent(options, paths):
+        raise spent
     if (restart := fd_store.lives()) > 1:
         restart = min(restart, asked("NRestarts", options.name, paths.is_of_user, restart))
         if (delay := policy.delay_before(restart)) > policy.delay:
             seconds = (delay - policy.unit_delay) / SECOND
             show(options.uuid, paths, seconds)
             time.sleep(seconds)
-    fd_store.count_life()
+    fd_store.count_life(_now_us())
+
+
+def find_spent(options: RunnerOptions, paths: CellPaths) -> RestartsSpent | None:
+    """The error of a restart that exceeds the budget of automatic restarts, None for others."""
+    policy, lives = options.restart, fd_store.lives()
+    if policy.policy == "no" or lives <= policy.max_restarts:
+        return None
+    lives = min(lives, asked("NRestarts", options.name, paths.is_of_user, lives))
+    starts = fd_store.life_times()[-lives:] if lives else []
+    _, used = count_restarts([*starts, _now_us()], policy.window)
+    if used <= policy.max_restarts:
+        return None
+    most, window = policy.max_restarts, format_duration(policy.window)
+    count = "1 automatic restart" if most == 1 else f"{most} automatic restarts"
+    hint = f"doractl why {options.name} tells what has failed"
+    return RestartsSpent(f"{count} within {window} did not help", hint)
+
+
+def _now_us() -> int:
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
 
 
 def hold_back(options: RunnerOptions, paths: CellPaths, old: float | None = None) -> None:
@@ -98,4 +126,5 @@ async def forget_restarts(options: RunnerOptions) -> None:
     if options.restart.policy != "no" and options.restart.window != INFINITY:
         await asyncio.sleep(options.restart.window / SECOND)
         fd_store.forget_lives()
-        fd_store.count_life()
+        # The window of this life is over: its next restart begins another one.
+        fd_store.count_life(_now_us() - options.restart.window)

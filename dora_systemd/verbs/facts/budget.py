@@ -34,7 +34,8 @@ def restart_budget(
     window = facts["StartLimitIntervalUSec"]
     if window in (0, INFINITY):
         return None
-    most = max(facts["StartLimitBurst"] - 1, 0)
+    # systemd's limit has room for starts by hand; a drop-in can make it smaller.
+    most = max(min(facts["StartLimitBurst"] - 1, cell.options.restart.max_restarts), 0)
     budget = unit_budget(
         _starts(scope, cell.name, facts["NRestarts"], (cell.uuid, cell.state, facts[_READY_SINCE])),
         most,

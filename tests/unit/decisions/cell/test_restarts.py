@@ -156,13 +156,15 @@ def unit(policy: RestartPolicy, **changes: Any) -> dict[str, Any]:
     return {key: one.value for key, one in restart_properties(options).items()}
 
 
-def test_three_restarts_are_four_starts() -> None:
+def test_systemd_counts_what_the_runner_does_not() -> None:
+    """Starts by hand count for systemd, too."""
     found = unit(POLICY)
-    assert (found["Restart"], found["StartLimitBurst"]) == ("on-failure", 4)
+    assert (found["Restart"], found["StartLimitBurst"]) == ("on-failure", 34)
     assert found["StartLimitIntervalSec"] == 10 * MINUTE
     assert found["RestartSec"] == SECOND * 3 // 5
     assert "RestartSteps" not in found, "it never forgets"
-    assert found["RestartPreventExitStatus"] == ((70, 72, 77, 78), ())
+    assert unit(POLICY._replace(max_restarts=64))["StartLimitBurst"] == 65, "systemd alone counts"
+    assert found["RestartPreventExitStatus"] == ((70, 72, 75, 77, 78), ())
 
 
 def test_delays_double_up_to_the_longest() -> None:
@@ -173,10 +175,11 @@ def test_delays_double_up_to_the_longest() -> None:
 def test_unit_without_restarts() -> None:
     assert unit(DEFAULT) == {
         "Restart": "no",
-        "RestartPreventExitStatus": ((70, 72, 77, 78), ()),
+        "RestartPreventExitStatus": ((70, 72, 75, 77, 78), ()),
         "RestartForceExitStatus": ((), (6,)),  # of the watchdog, which says nothing of the nodes
     }
-    assert unit(POLICY, attached=True)["RestartPreventExitStatus"] == ((0, 70, 71, 72, 77, 78), ())
+    attached = unit(POLICY, attached=True)["RestartPreventExitStatus"]
+    assert attached == ((0, 70, 71, 72, 75, 77, 78), ())
     assert unit(POLICY._replace(max_restarts=INFINITY))["StartLimitIntervalSec"] == 0
 
 

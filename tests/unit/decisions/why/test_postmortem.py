@@ -296,6 +296,23 @@ def test_restarts_of_the_whole_and_the_limit_of_them() -> None:
     assert "systemd has stopped restarting it" in text
 
 
+def test_a_restart_that_the_runner_refuses_is_none() -> None:
+    spent = "1 automatic restart within 10min did not help"
+    lives = (
+        *(*RUNS, event("daemon-lost"), failed("daemon-lost", "gone"), unit("unit-restart")),
+        *(event("dataflow-starting", life="2"), failed("daemon-lost", "again", life="2")),
+        unit("unit-restart", "2"),
+        failed("restarts-spent", spent, life="3"),
+    )
+    verdict = judge(*lives, unit("unit-failed", "3"), facts=Facts("Failed", restarts=2))
+    assert (verdict.status, verdict.cause) == ("Failed", Cause.DAEMON_LOST)
+    assert (verdict.summary, verdict.invocation) == ("again", "2")
+    assert verdict.is_given_up
+    assert [one.reason for one in verdict.restarts] == ["gone"]
+    alone = judge(*lives[-1:], facts=Facts("Failed", restarts=2))
+    assert (alone.cause, alone.summary) == (Cause.RESTARTS_SPENT, spent)
+
+
 def test_restarts_are_those_that_list_counts() -> None:
     def restarted(node: str, life: str) -> Record:
         return event("node-restarted", node, life)

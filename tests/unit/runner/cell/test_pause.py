@@ -8,6 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,11 +22,12 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.pause import (
     asked,
+    find_spent,
     forget_restarts,
     hold_back,
     pause,
 )
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.programs import make_program
 
 DELAY = SECOND // 2
@@ -41,6 +43,7 @@ class Unit:
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.paths, self.slept, self.old = CellPaths(root), 0.0, 0.0
         self.monkeypatch = monkeypatch
+        self.times: list[int] = []
         self.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self.server.bind(str(root / "notify"))
         monkeypatch.setenv("NOTIFY_SOCKET", str(root / "notify"))
@@ -86,6 +89,8 @@ class Unit:
                 del self.store[lines["FDNAME"]]
             else:
                 self.store[lines["FDNAME"]] += len(fds)
+            if lines.get("FDNAME") == fd_store.LIFE and fds:
+                self.times.append(int(os.pread(fds[0], 32, 0)))
             for fd in fds:
                 os.close(fd)
 
@@ -114,6 +119,57 @@ def test_it_doubles_up_to_the_longest(unit: Unit) -> None:
     assert POLICY.unit_delay / SECOND == 0.1
     pauses = [round(0.1 + unit.start(restarts), 6) for restarts in range(9)]
     assert pauses == [0.1, 0.5, 1, 2, 4, 8, 16, 30, 30]
+
+
+def spent(unit: Unit, ages: list[int], restarts: int, policy: RestartPolicy) -> str:
+    """Why the restart after lives that began so many seconds ago is refused, or ""."""
+    now = time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
+    with ExitStack() as stack:
+        fds = [os.memfd_create(fd_store.LIFE) for _ in ages]
+        for fd, seconds in zip(fds, ages, strict=True):
+            stack.callback(os.close, fd)
+            os.write(fd, str(now - seconds * SECOND).encode())
+        names = ["other"] * (fds[0] - 3) + [fd_store.LIFE] * len(fds)
+        assert fds == [*range(fds[0], fds[0] + len(fds))]
+        unit.monkeypatch.setenv("LISTEN_FDNAMES", ":".join(names))
+        (unit.paths.root / "restarts").write_text(f"{restarts}\n")
+        error = find_spent(unit.options(policy), unit.paths)
+    return error.message if error else ""
+
+
+THREE = POLICY._replace(max_restarts=3)
+
+
+@pytest.mark.parametrize(
+    ("ages", "restarts", "policy", "is_spent"),
+    [
+        ([4, 3, 2], 3, THREE, False),
+        ([5, 4, 3, 2], 4, THREE, True),
+        # systemctl reset-failed, or a start by hand, while the store was kept
+        ([5, 4, 3, 2], 0, THREE, False),
+        ([6, 5, 4, 3, 2], 3, THREE, False),
+        # The window of the first ones is over.
+        ([700, 4, 3, 2], 4, THREE, False),
+        ([700, 5, 4, 3, 2], 5, THREE, True),
+        ([5, 4, 3, 2], 4, THREE._replace(policy="no"), False),
+        ([5, 4, 3, 2], 4, THREE._replace(max_restarts=INFINITY), False),
+    ],
+)
+def test_a_restart_beyond_the_budget_is_refused(
+    unit: Unit, ages: list[int], restarts: int, policy: RestartPolicy, is_spent: bool
+) -> None:
+    words = "3 automatic restarts within 10min did not help"
+    assert spent(unit, ages, restarts, policy) == (words if is_spent else "")
+
+
+def test_each_life_says_when_it_began(unit: Unit) -> None:
+    before = time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
+    unit.start(0)
+    asyncio.run(forget_restarts(unit.options(POLICY._replace(window=1))))
+    unit.keep_store()
+    first, after_window = unit.times
+    assert before <= first <= time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
+    assert after_window >= first - 1
 
 
 def test_a_quiet_window_is_forgotten(unit: Unit) -> None:
