@@ -25,6 +25,7 @@ from dora_systemd.decisions.logs.query import (
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import LINK_PREFIX
+from dora_systemd.trust.programs import check_program
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.recorded import find_query, find_soon
 from dora_systemd.verbs.logs import pass_logs, read_logs, write_whole
@@ -211,7 +212,7 @@ def command(
         return ExitCode.OK
     if no_pager or query.is_follow or lines is None:
         return _exit_status(_print(query, lines))
-    _page(read_logs(query, lines, wants_colors(sys.stdout)))
+    print_paged(read_logs(query, lines, wants_colors(sys.stdout)))
     return ExitCode.OK
 
 
@@ -283,12 +284,13 @@ def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
     return next(filter(None, names), "less"), environment
 
 
-def _page(chunks: Iterator[bytes]) -> None:
+def print_paged(chunks: Iterator[bytes]) -> None:
     """Print to the pager that journalctl(1) would use, with the same options."""
     pager, environment = pager_of(os.environ)
     if not shutil.which(pager.split()[0]) or pager == "cat" or is_dumb():
         _write(chunks, sys.stdout.fileno())
         return
+    check_program(pager.split()[0])
     with subprocess.Popen(pager, shell=True, stdin=subprocess.PIPE, env=environment) as child:
         assert child.stdin
         try:

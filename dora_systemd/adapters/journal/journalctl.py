@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import check_program
 
 CHUNK = 1 << 18
 """Bytes of one read from it."""
@@ -29,8 +30,10 @@ def open_journalctl(
     """A running journalctl, which the block ends.
 
     outlives_interrupt: Ctrl+C on the terminal does not reach it, see setpgid(2).
-    Raises DoraSystemdError (NO_SYSTEMD) if there is no journalctl.
+    Raises DoraSystemdError: NO_SYSTEMD if there is no journalctl, NO_PERMISSION if root would run
+    another user's.
     """
+    check_program("journalctl")
     environment = {**os.environ, "SYSTEMD_COLORS": "1" if want_colors else "0", "LC_ALL": "C.UTF-8"}
     # Not a pipe: what it says of damaged files, before anybody reads it, can be more than that has.
     complaints = os.fdopen(os.memfd_create("journalctl"), "rb")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import check_program
 
 _MOST_BYTES = 1 << 16
 """Of what ssh has said, the last."""
@@ -18,8 +19,10 @@ _MOST_BYTES = 1 << 16
 def start_ssh(arguments: Sequence[str], **streams: Any) -> "subprocess.Popen[bytes]":
     """A running ssh. streams: as for subprocess.Popen().
 
-    Raises DoraSystemdError (NO_HOST) if there is no ssh.
+    Raises DoraSystemdError: NO_HOST if there is no ssh, NO_PERMISSION if root would run another
+    user's.
     """
+    check_program("ssh")
     try:
         return subprocess.Popen(["ssh", *arguments], **streams)
     except OSError as error:
@@ -31,6 +34,7 @@ def start_here(command: str, **streams: Any) -> "subprocess.Popen[bytes]":
     """The command of a login shell, on this machine. streams: as for subprocess.Popen()."""
     # This doractl need not be one that a login shell would find.
     path = f"{os.environ.get('PATH', os.defpath)}:{Path(sys.executable).parent}"
+    check_program("sh")
     return subprocess.Popen(["sh", "-c", command], env={**os.environ, "PATH": path}, **streams)
 
 

@@ -22,6 +22,7 @@ from dora_systemd.decisions.machines.push import (
 )
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import check_program
 from dora_systemd.trust.tree import strange_part
 from dora_systemd.values import shown
 from dora_systemd.verbs.machines.probe import ask_as_caller
@@ -79,6 +80,7 @@ def place_problem(directory: Path, way_out: str) -> tuple[str, str] | None:
     """
     if shutil.which("rsync") is None:
         return f"{_NONE} on {os.uname().nodename}", f"there: {INSTALL}"
+    check_program("ssh")  # which rsync looks up in PATH
     if os.geteuid() == 0 and (strange := strange_part(directory)):
         return strange, f"root only copies what is root's; {way_out}"
     return None
