@@ -29,14 +29,16 @@ FOLDERS = (
 TEXTS = ("trust/courier.py", "trust/eyes.py")
 LEAST_PERCENT = 85.0
 PLACE = Path("/var/tmp")  # not below /tmp, which is another one for the mutants
-_FIRST = "dora_systemd.decisions.releases.versions.*"
+_NONE = "no mutant has this name"
+_STATS = "mutmut-stats.json"
 _IGNORED = (".*", "__pycache__", "dist", "mutants")
-# A mutant is root and may do anything: all but the copy is read-only, and /tmp is its own. mutmut
-# sends a signal to the number of each process that may hang, also when another program has that
-# number, so it gets numbers of its own; this sh(1) reaps the orphans.
+# A mutant is root and may do anything: all but the copy is read-only, and /tmp and /var/tmp are its
+# own. mutmut sends a signal to the number of each process that may hang, also when another program
+# has that number, so it gets numbers of its own; this sh(1) reaps the orphans.
 _APART = ("unshare", "--pid", "--fork", "--kill-child", "--mount-proc")
 _INSIDE = """set -e
-mount --bind . . && mount --bind tmp /tmp && mount -o remount,bind,ro /
+mount --bind . . && mount --bind . "var-tmp/${PWD##*/}" && mount --rbind var-tmp "${PWD%/*}"
+mount --bind tmp /tmp && mount -o remount,bind,ro /
 cd "$PWD"
 mutmut run --max-children 1 "$@"; exit $?
 """
@@ -75,16 +77,19 @@ def prepare(tree: Path, folders: Sequence[str]) -> None:
     text = "".join("\n    ".join([f"{key} =", *values]) + "\n" for key, values in lines.items())
     (tree / "setup.cfg").write_text(f"[mutmut]\n{text}")
     (tree / "mutants").mkdir()  # Python takes no path of PYTHONPATH that comes later
+    (tree / "var-tmp" / tree.name).mkdir(parents=True)
     (tree / "tmp").mkdir()
-    (tree / "tmp").chmod(0o1777)
+    for name in ("tmp", "var-tmp"):
+        (tree / name).chmod(0o1777)
 
 
 def run(tree: Path, seed: int, sample: int) -> int:
     """Run a sample of the mutants, and print what has become of them."""
     place = tree / "mutants"
-    call_mutmut(tree, [_FIRST])  # makes all mutants, and learns which tests call which function
+    # Makes all mutants, learns which tests call which function, and fails for want of a mutant.
+    call_mutmut(tree, [_NONE], place / _STATS)
     everything = read_mutants(place)
-    add_tests(place / "mutmut-stats.json", everything)
+    add_tests(place / _STATS, everything)
     names = [one.name for one in everything]
     chosen = set(random.Random(seed).sample(names, min(sample, len(names))))
     print(f"{len(chosen)} of {len(names)} mutants, SEED={seed}", flush=True)
@@ -112,8 +117,8 @@ def add_tests(file: Path, mutants: Sequence[Mutant]) -> None:
     file.write_text(json.dumps(stats))
 
 
-def call_mutmut(tree: Path, names: Sequence[str]) -> None:
-    """Run the mutants of these names. Ends this program if mutmut fails."""
+def call_mutmut(tree: Path, names: Sequence[str], made: Path | None = None) -> None:
+    """Run the mutants of these names. Ends this program if that fails, and `made` is not there."""
     env = {
         **os.environ,
         "PYTHONPATH": f"{tree}/mutants",
@@ -124,7 +129,7 @@ def call_mutmut(tree: Path, names: Sequence[str]) -> None:
     with (tree / "mutmut.log").open("w") as log:
         command = ["nice", "-n", "15", *_APART, "sh", "-c", _INSIDE, "sh", *names]
         done = subprocess.run(command, cwd=tree, env=env, stdout=log, stderr=log, check=False)
-    if done.returncode:
+    if done.returncode and not (made and made.exists()):
         sys.exit((tree / "mutmut.log").read_text(errors="replace")[-4000:])
 
 
