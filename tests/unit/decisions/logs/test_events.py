@@ -73,3 +73,13 @@ def test_details_cannot_replace_the_event() -> None:
     assert fields["DORA_EVENT"] == "reloaded"
     assert fields["MESSAGE"] == "Dataflow r was reloaded: 2 files changed"
     assert fields["DORA_REASON"] == "2 files changed"
+
+
+def test_what_is_not_known_is_told_so() -> None:
+    assert event_fields("node-ready")["MESSAGE"] == "Node (node unknown) is ready"
+    fields = event_fields("node-asked", node="a", asked="stop", by="eve", exit="", reason="x")
+    assert fields["MESSAGE"] == "Node a: stop requested by eve: x"
+    assert (fields["DORA_BY"], fields["DORA_EXIT"], fields["DORA_REASON"]) == ("eve", "", "x")
+    both = event_fields("node-crashed", node="a", reason="late", exit="exit code 1")
+    assert both["MESSAGE"] == "Node a crashed: exit code 1: late"
+    assert not {"DORA_NODE", "DORA_DATAFLOW"} & {*event_fields("reloaded", dataflow="r", node="n")}

@@ -57,3 +57,19 @@ def test_export_reader(entries: list[dict[str, bytes]], size: int) -> None:
         for entry in reader.feed(data[start : start + size])
     ]
     assert found == entries
+
+
+def test_names_for_journald() -> None:
+    assert legal_name("a b-ä.c", "DORA_") == "DORA_A_B_C"
+    assert legal_name("", "DORA_") == "DORA_"
+    assert legal_name("x" * 99, "DORA_") == "DORA_" + "X" * 59
+
+
+def test_values() -> None:
+    assert encode_entry({"A": "é\udcff", "B": 7, "C": b"\xfe"}) == b"A=\xc3\xa9\xff\nB=7\nC=\xfe\n"
+    assert encode_entry({"A": "a\nb"}) == b"A\n\x03\0\0\0\0\0\0\0a\nb\n"
+
+
+def test_names_and_repeated_fields_of_other_writers() -> None:
+    found = ExportReader().feed(b"\n\nA=1\nA=2\n\xff=3\n\n")
+    assert found == [{"A": b"2", "\ufffd": b"3"}]

@@ -51,3 +51,23 @@ def test_lines_of_the_dora_command() -> None:
 def test_a_terminal_gets_no_control_characters() -> None:
     for form in ("json", "compact"):
         assert b"\x1b" not in DoraLines(form, "u-1", is_terminal=True).record(RAW)
+
+
+def test_the_words_for_no_filter() -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_filter("a=info, camera = loud ")
+    assert caught.value.message == "cannot read 'camera = loud' as a log filter"
+    levels = "error, warn, info, debug, trace, stdout"
+    assert caught.value.hint == f"write NODE=LEVEL,...; levels: {levels}"
+    assert parse_filter(" a = INFO ,, b=Stdout") == {"a": "info", "b": "stdout"}
+    assert parse_filter("") == {}
+
+
+@pytest.mark.parametrize("level", ["error", "warn", "info", "debug", "trace"])
+def test_a_level_shows_itself_and_what_is_worse(level: str) -> None:
+    levels = ["error", "warn", "info", "debug", "trace"]
+    records = [{"DORA_LEVEL": one.encode()} for one in levels]
+    shown = [record for record in records if LogFilter(level).shows(record)]
+    assert shown == records[: levels.index(level) + 1]
+    assert not LogFilter(level).shows(RAW)
+    assert LogFilter().shows(RAW)

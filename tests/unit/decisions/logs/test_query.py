@@ -13,6 +13,7 @@ from dora_systemd.decisions.logs.query import (
     failure_matches,
     is_boot,
     journal_time,
+    journal_timestamp,
     parse_level,
     query_arguments,
     query_matches,
@@ -184,3 +185,44 @@ def test_a_story_has_three_sources(scope: Scope) -> None:
     assert [*systemds, f"MESSAGE_ID={UNIT_STARTING}"] == start_matches(scope, "robot")
     asked = [f"DORA_EVENT={event}" for event in REQUESTS]
     assert requests == [f"DORA_DATAFLOW={UID}", *asked, f"_UID={scope.uid}"]
+
+
+def test_all_arguments() -> None:
+    query = LogQuery(SYSTEM, until="5m", is_reverse=True, want_unprintable=True, cursor_file="/c")
+    assert query_arguments(query) == [
+        *("--output=short", "--quiet", "--until=-5m", "--cursor-file=/c", "--reverse", "--all"),
+        *("--", "_SYSTEMD_SLICE=dora.slice"),
+    ]
+    assert query_arguments(LogQuery(SYSTEM, output="short-precise"))[1] == "--"
+
+
+@pytest.mark.parametrize(("tail", "is_counted"), [("", False), ("all", False), ("0", True)])
+def test_whether_only_the_last_ones_are_wanted(tail: str, is_counted: bool) -> None:
+    assert LogQuery(SYSTEM, tail=tail).is_counted is is_counted
+
+
+@pytest.mark.parametrize(
+    ("us", "text"), [(0, "@0.000000"), (1_000_001, "@1.000001"), (999_999, "@0.999999")]
+)
+def test_a_moment(us: int, text: str) -> None:
+    assert journal_timestamp(us) == text
+
+
+def test_both_ends_of_a_unit() -> None:
+    ids = ["MESSAGE_ID=7ad2d189f7e94e70a38c781354912448", f"MESSAGE_ID={UNIT_FAILED}"]
+    assert end_matches(SYSTEM, "robot") == ["UNIT=dora-robot.service", "_PID=1", *ids]
+
+
+def test_the_words_for_an_unknown_level() -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_level("Loud")
+    assert caught.value.message == "cannot use 'Loud' as a level"
+    known = "error, warn, info, debug, trace, stdout; those of syslog are understood too"
+    assert caught.value.hint == f"one of {known}"
+
+
+def test_debug_with_nodes_and_all_before_it() -> None:
+    found = query_matches(LogQuery(SYSTEM, name="robot", nodes=("a",), level="debug"))
+    info = [f"PRIORITY={number}" for number in range(7)]
+    node = [ROBOT, "DORA_NODE=a"]
+    assert found == [*node, *info, "+", *node, "PRIORITY=7", "DORA_LEVEL=debug"]

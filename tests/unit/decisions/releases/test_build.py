@@ -1,5 +1,6 @@
 """What a build is, and what is made of its lines."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,10 +10,12 @@ from dora_systemd.decisions.releases.build import (
     BuildTask,
     build_commands,
     build_environment,
+    build_unit,
     built_nodes,
     format_task,
     has_builds,
     is_output,
+    lock_places,
     parse_task,
     parse_uv_error,
     shown_line,
@@ -109,3 +112,66 @@ UV = {
 @pytest.mark.parametrize(("printed", "expected"), UV.items())
 def test_what_uv_gives_as_its_reason(printed: str, expected: str) -> None:
     assert parse_uv_error(printed) == expected
+
+
+def test_where_a_release_is_built() -> None:
+    assert build_unit("robot") == "doractl-build-robot.service"
+    assert lock_places("flows/x.yml") == ("flows/uv.lock", "uv.lock")
+    assert lock_places("x.yml") == ("uv.lock", "uv.lock")
+
+
+def test_all_variables_of_a_build() -> None:
+    always = {
+        **{"SOURCE_DATE_EPOCH": "315532800", "UV_COMPILE_BYTECODE": "1", "UV_NO_CACHE": "1"},
+        **{"UV_LINK_MODE": "copy", "UV_PYTHON_DOWNLOADS": "never"},
+        **{"UV_PYTHON_PREFERENCE": "only-system", "PIP_NO_INPUT": "1", "GIT_TERMINAL_PROMPT": "0"},
+    }
+    assert build_environment({}, None, None) == always
+    own = {"VIRTUAL_ENV": "/v", "UV_PROJECT_ENVIRONMENT": "/v"}
+    assert build_environment({"A": "b"}, "/v", None) == {
+        **{**always, **own, "A": "b", "PATH": "/v/bin:"}
+    }
+    given = {"PATH": "/bin:/old/bin:/usr/bin"}
+    assert build_environment(given, "/v", "/old")["PATH"] == "/v/bin:/bin:/old/bin:/usr/bin"
+
+
+@pytest.mark.parametrize("key", ["build", "git", "module"])
+def test_the_keys_that_make_a_build(key: str) -> None:
+    assert has_builds([{}, {"nodes": [{key: "x"}]}])
+    assert not has_builds({"nodes": [{key: ""}]})
+    shared: dict[str, object] = {"path": "a.py"}
+    assert has_builds([shared, shared, {key: "x"}]), "what comes twice ends nothing"
+
+
+def test_a_node_with_other_things_in_the_place_of_operators() -> None:
+    for operators in ("x", {"build": "make"}, ["x"], None):
+        node = {"id": "a", "path": "a.py", "operators": operators, "operator": "x"}
+        dataflow = parse_dataflow({"nodes": [{"id": "b", "path": "b"}]}, "/x.yml")
+        node_of = replace(dataflow.nodes[0], raw=node)
+        assert built_nodes(replace(dataflow, nodes=(node_of,))) == []
+
+
+def test_commands_without_a_lock() -> None:
+    assert build_commands(["a.py"], "/r", "x.yml", "/bin/uv", "") == ()
+
+
+def test_long_errors_of_uv_are_cut() -> None:
+    assert len(parse_uv_error("error: " + "x" * 999)) == 300
+    assert len(shown_line("x" * 300)) == 300
+    assert parse_uv_error("  error: indented") == ""
+    assert parse_uv_error("warning: x\nerror: a\n  Caused by: b") == "uv: a: b"
+    assert parse_uv_error(" × a\n │ b\n ├─▶ c") == "uv: a │ b: c"
+
+
+@pytest.mark.parametrize(
+    ("line", "shown", "is_of_command"),
+    [
+        ("a-b.c: stderr x", "a-b.c: x", True),
+        ("a: stdout   ", "a: stdout", False),
+        ("a b: stdout x", "a b: stdout x", False),
+        ("a: warn x", "a: warn x", False),
+        (" a: WARN  x ", "a: x", False),
+    ],
+)
+def test_lines_of_a_node(line: str, shown: str, is_of_command: bool) -> None:
+    assert (shown_line(line), is_output(line)) == (shown, is_of_command)

@@ -8,6 +8,7 @@ from dora_systemd.decisions.releases.choice import Known, before, state_of, surp
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.ids import is_revision, new_id
 from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
+from dora_systemd.decisions.releases.past import REPLACED, ROLLED_BACK, Switch
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_release_id, release_of
 
@@ -92,3 +93,34 @@ def test_texts_that_are_no_texts() -> None:
 def test_bad_manifests(text: str) -> None:
     with pytest.raises(DoraSystemdError, match="does not describe a release"):
         parse_manifest(text, "/x/release.json")
+
+
+@pytest.mark.parametrize(
+    ("keep", "used", "gone"),
+    [
+        # 3 and 5 have not run well; 4 is before the present one, which is 6.
+        (1, (), [0, 1, 2, 3, 5]),
+        (2, (), [0, 1, 2, 3, 5]),
+        (3, (), [0, 1, 3, 5]),
+        (5, (), [3, 5]),
+        (6, (), [3]),
+        (7, (), []),
+        (1, (0, 5), [1, 2, 3]),
+    ],
+)
+def test_which_releases_go(keep: int, used: tuple[int, ...], gone: list[int]) -> None:
+    found = surplus(KNOWN, keep, DAYS[6], [DAYS[one] for one in used])
+    assert found == [DAYS[one] for one in gone]
+    assert surplus(KNOWN[::-1], keep, DAYS[6], [DAYS[one] for one in used]) == found
+
+
+def test_a_release_that_was_rolled_back_from_goes_before_older_ones() -> None:
+    past = [
+        Switch(0, "", DAYS[0], REPLACED),
+        Switch(0, DAYS[0], DAYS[1], REPLACED),
+        Switch(0, DAYS[1], DAYS[2], REPLACED),
+        Switch(0, DAYS[2], DAYS[1], ROLLED_BACK),
+    ]
+    assert surplus(KNOWN[:3], 2, DAYS[1], (), past) == [DAYS[2]]
+    assert state_of(KNOWN[2], DAYS[1], "", past[-1]) == ROLLED_BACK
+    assert before(KNOWN[:3], DAYS[1], past) == DAYS[0]

@@ -14,9 +14,12 @@ from dora_systemd.decisions.releases.entries import (
     Stored,
     check_amount,
     check_found,
+    is_plain_path,
+    too_many,
     touched,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import shown
 
 
 @pytest.mark.parametrize(
@@ -103,3 +106,55 @@ def test_what_has_changed() -> None:
     old = {"a": Stored(1, False, "x"), "b": Stored(1, False, "y"), "c": Stored(target="a")}
     new = {"a": Stored(1, True, "x"), "b": Stored(1, False, "y"), "d": Stored(target="a")}
     assert touched(old, new) == {"added": ["d"], "changed": ["a"], "removed": ["c"]}
+
+
+IGNORE = "remove it, or name it in .gitignore"
+RELATIVE = "link to a file of the project by a relative path, or copy what it leads to"
+OTHER = "link to a file of the project, or copy what it leads to"
+OUTSIDE = "it links to /etc/shadow, an absolute path, which is outside of every release"
+WORDS = (
+    (Found("a\nb", FILE), "its name is not printable text", "rename it"),
+    (Found("x", "socket"), "it is a socket", IGNORE),
+    (Found("l", LINK, target="/etc/shadow"), OUTSIDE, RELATIVE),
+    (Found("l", LINK, target="../a"), "it links to ../a, which is not in the project", OTHER),
+    (Found("l", LINK, target="a/.."), "it links to a/.., with .. behind a name", OTHER),
+    (Found("l", LINK, target="a\n"), "its target is not printable text", OTHER),
+    (Found("l", LINK), "its target is not printable text", OTHER),
+)
+
+
+@pytest.mark.parametrize(("one", "reason", "hint"), WORDS)
+def test_the_words_of_a_refusal(one: Found, reason: str, hint: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        check_found(one)
+    message = f"cannot copy {shown(one.path)}: {reason}"
+    error = caught.value
+    assert (error.message, error.hint, error.code) == (message, hint, ExitCode.BAD_INPUT)
+
+
+@pytest.mark.parametrize("text", ["a" * 1024, "é" * 512, "a/" * 511 + "bb"])
+def test_the_longest_names(text: str) -> None:
+    check_found(Found(text, FILE))
+    check_found(Found("l", LINK, target=text))
+    assert is_plain_path(text)
+    assert not is_plain_path(f"{text}x")
+
+
+def test_the_longest_target() -> None:
+    check_found(Found("l", LINK, target="é" * 1024))
+    with pytest.raises(DoraSystemdError, match="its target is not printable text"):
+        check_found(Found("l", LINK, target="é" * 1025))
+
+
+def test_the_words_for_too_much() -> None:
+    found = [Found("a", FILE, 1 << 30), Found("l", LINK, 1 << 40), Found("b", FILE, 4 << 30)]
+    with pytest.raises(DoraSystemdError) as caught:
+        check_amount(found)
+    assert caught.value.message == "cannot copy b: the project has 5G, 4G of it here"
+    hint = "a release has at most 4G: keep data elsewhere, or name it in .gitignore"
+    assert caught.value.hint == hint
+    assert check_amount(found[:2]) == 1 << 30
+    many, top = too_many("data"), too_many("")
+    assert many.message == "cannot copy data: the project has more than 100000 files"
+    assert many.hint == "name directories of data in .gitignore"
+    assert top.message.startswith("cannot copy .: ")

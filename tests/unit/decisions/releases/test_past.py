@@ -1,5 +1,6 @@
 """What ran is a history: what a rollback takes, and what is kept, after each course of events."""
 
+import json
 from collections.abc import Sequence
 
 import pytest
@@ -24,6 +25,7 @@ from dora_systemd.decisions.releases.past import (
     marks,
     parse_history,
     runs,
+    undone,
 )
 
 
@@ -202,3 +204,85 @@ def test_a_long_history_keeps_what_it_is_for() -> None:
     assert release("B") in marks(stay)
     assert runs(stay) == [release("A")]
     assert len(kept(course.history * 1000, {release("A")})) <= MOST_LINES
+
+
+def test_the_line_of_a_switch() -> None:
+    one = Switch(7, release("A"), "", FAILED, "root (x)", "a\n b", "camera", "ff")
+    assert format_switch(one) == (
+        b'{"at_us": 7, "from": "20261101T220012", "to": "", "ended": "failed", '
+        b'"by": "root (x)", "reason": "a b", "node": "camera", "invocation": "ff"}\n'
+    )
+    assert parse_history(format_switch(one)) == [one._replace(reason="a b")]
+
+
+@pytest.mark.parametrize("name", ["by", "reason", "node"])
+@pytest.mark.parametrize(("text", "kept_text"), [("x" * 801, "x" * 800), ("é" * 401, "é" * 400)])
+def test_long_texts_are_cut(name: str, text: str, kept_text: str) -> None:
+    line = format_switch(Switch(1, "", release("A"), REPLACED, **{name: text}))
+    (found,) = parse_history(line)
+    assert getattr(found, name) == kept_text
+
+
+@pytest.mark.parametrize("how", [REPLACED, ROLLED_BACK, FAILED, INTERRUPTED, REMOVED])
+def test_which_changes_are_commits(how: str) -> None:
+    one = ONE._replace(how=how)
+    assert one.is_commit is (how in (REPLACED, ROLLED_BACK))
+    assert not one._replace(release="").is_commit
+    assert parse_history(format_switch(one))[0].how == how
+
+
+@pytest.mark.parametrize("key", ["at_us", "from", "to", "ended", "by", "reason"])
+def test_a_line_without_one_of_its_keys(key: str) -> None:
+    value = json.loads(format_switch(ONE))
+    del value[key]
+    assert parse_history(json.dumps(value).encode() + b"\n") == []
+
+
+@pytest.mark.parametrize(
+    ("events", "how"),
+    [
+        ("", ""),
+        ("A", ""),
+        ("A B", ""),
+        ("A B ^", ROLLED_BACK),
+        ("A x:B", FAILED),
+        ("A !:B", INTERRUPTED),
+        ("A B ^ -B", ROLLED_BACK),
+        ("A x:B C", ""),
+    ],
+)
+def test_what_was_undone_last(events: str, how: str) -> None:
+    last = undone(Course(events).history)
+    assert (last.how if last else "") == how
+
+
+def test_when_a_release_began_and_ended() -> None:
+    past = [
+        *(Switch(1, "", release("A"), REPLACED), Switch(2, release("A"), release("B"), REPLACED)),
+        *(Switch(3, release("C"), release("B"), FAILED), Switch(4, release("B"), "", REMOVED)),
+        Switch(5, release("B"), release("A"), ROLLED_BACK),
+        Switch(6, release("A"), release("A"), REPLACED),
+    ]
+    assert begins(past) == {release("A"): 5, release("B"): 3}
+    assert {one: end.at_us for one, end in ends(past).items()} == {
+        **{release("A"): 6, release("C"): 3, release("B"): 5}
+    }
+
+
+def test_the_missing_change_has_the_time_that_is_known() -> None:
+    past = Course("A B").history
+    assert completed(past, release("C"), 9)[-1] == Switch(9, release("B"), release("C"), REPLACED)
+    assert completed(past, release("C"))[-1].at_us == 0
+    removed = [*past, Switch(5, release("A"), release("B"), REMOVED)]
+    assert completed(removed, release("B")) == removed
+    assert how_of(past, release("B")) == REPLACED
+    assert how_of(past, release("A")) == ROLLED_BACK
+
+
+def test_the_newest_half_is_kept() -> None:
+    past = [Switch(n, release("A"), release("B"), FAILED) for n in range(MOST_LINES)]
+    stay = kept(past, [release("A")])
+    assert [one.at_us for one in stay] == [*range(MOST_LINES // 2, MOST_LINES)]
+    assert kept(past, [release("B")]) == []
+    runs_ = [one._replace(how=REPLACED) for one in past]
+    assert len(kept(runs_, [])) == MOST_LINES // 2

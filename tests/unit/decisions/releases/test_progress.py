@@ -108,3 +108,53 @@ def test_a_sign_of_life() -> None:
     steps = [(0.0, one), (29.0, one), (30.0, one), (59.0, one), (61.0, one)]
     assert len(shown(Pace(1, 30), *steps)) == 3
     assert len(shown(Pace(1), *steps)) == 1
+
+
+FACTS = {
+    waiting("x"): ("wait", None, None, None, False),
+    copying(5, 9): ("copy", (5, 9), None, None, False),
+    copied(2, 9, 5): ("copy", (9, 9), None, None, True),
+    checking(): ("check", None, None, None, False),
+    building("x"): ("build", None, None, None, False),
+    stopping("stopping, a left"): ("stop", None, None, None, False),
+    starting("1/3 nodes ready"): ("start", None, (1, 3), None, False),
+    soaking("3/3 nodes running", 5, 9): ("soak", (5, 9), (3, 3), None, False),
+    soaking("3/3 nodes running", 9, 9): ("soak", (9, 9), (3, 3), None, True),
+    soaking("", 10, 9): ("soak", (9, 9), None, None, True),
+    soaking("", 9, 9, "camera/image"): ("soak", (9, 9), None, None, False),
+    judged("X", ""): ("verdict", None, None, True, False),
+    judged("X", "y"): ("verdict", None, None, False, False),
+    going_back("X", "2/3 nodes ready"): ("back", None, (2, 3), None, False),
+}
+
+
+@pytest.mark.parametrize(("step", "facts"), FACTS.items())
+def test_what_programs_are_told(step: Step, facts: tuple[object, ...]) -> None:
+    assert (step.stage, *step[2:]) == facts
+
+
+def test_what_the_verdict_waits_for() -> None:
+    step = soaking("1/1 nodes running; 1 nodes running", SECOND, 2 * SECOND, "camera/image")
+    words = "trial: 1/1 nodes ready; 1 nodes running, soak 1/2 s, waits for camera/image"
+    assert step.text == words
+
+
+@pytest.mark.parametrize(
+    ("soak", "words"),
+    [(600 * SECOND, "61/600 s"), (601 * SECOND, "1min 1s of 10min 1s")],
+)
+def test_a_long_soak(soak: int, words: str) -> None:
+    assert soaking("", 61_900_000, soak).text == f"trial: up, soak {words}"
+
+
+def test_when_what_grows_is_shown() -> None:
+    pace = Pace(10, 30)
+    at = [0.0, 9.9, 10.0, 19.9, 20.0]
+    steps = [soaking("", number, 99 * SECOND) for number in range(5)]
+    steps = [one._replace(text=f"{number}") for number, one in enumerate(steps)]
+    shown_ones = [pace.takes(step, now) for step, now in zip(steps, at, strict=True)]
+    assert shown_ones == [True, False, True, False, True]
+    assert not pace.takes(steps[-1], 49.9), "the same text is no news"
+    assert pace.takes(steps[-1], 50.0)
+    assert pace.takes(steps[-1]._replace(text="x", nodes=(1, 2)), 50.0)
+    assert pace.takes(steps[-1]._replace(text="y", nodes=(1, 2), is_last=True), 50.0)
