@@ -25,12 +25,14 @@ class Recheck:
 
     def __init__(self, role: Alone, environment: Mapping[str, str], answer: Answer) -> None:
         self._role, self._environment, self._others = role, environment, answer
+        role.find_own_refusal = self.find_refusal
 
     async def answer(self, request: Request) -> dict[str, Any]:
         """Answer one request. Raises DoraSystemdError as `answer` does."""
         if request.get("verb") != "check":
             return await self._others(request)
-        return refused_reply(await asyncio.to_thread(self.find_refusal))
+        refusal = await asyncio.to_thread(self.find_refusal)
+        return refused_reply(refusal or await self._role.find_refusal())
 
     def find_refusal(self) -> DoraSystemdError | None:
         """Check the dataflow; the error that a start would end with, or None."""

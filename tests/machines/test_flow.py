@@ -61,6 +61,14 @@ def test_again_and_a_restart(flow: Flow) -> None:
     done = flow.cell.doractl("restart", NAME)
     assert done.returncode == 0, done.stderr
     flow.wait_again(life)
+    # What could not start again keeps running.
+    there("b", f"cp {PLACE}/dataflow.yml /tmp/good; echo '# changed' >> {PLACE}/dataflow.yml")
+    life = flow.life()
+    refused = flow.cell.doractl("restart", NAME, check=False)
+    assert "machine gpu: " in refused.stderr
+    assert "is not the same file as on the head" in refused.stderr
+    assert (refused.returncode, flow.life()) == (ExitCode.BAD_INPUT, life)
+    there("b", f"cp /tmp/good {PLACE}/dataflow.yml")
     flow.cell.doractl("stop", NAME)
     flow.start()
     flow.wait_exchanging()

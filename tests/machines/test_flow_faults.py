@@ -161,6 +161,9 @@ def test_a_cable_is_out(flow: Flow, how: str) -> None:
 @lost
 def test_a_stop_while_a_machine_is_away(flow: Flow) -> None:
     with cable("b", "mute"):
+        refused = flow.cell.doractl("restart", NAME, check=False)
+        assert "cannot reach machine gpu: " in refused.stderr
+        assert "--force" in refused.stderr
         begun = time.monotonic()
         done = flow.cell.doractl("stop", NAME)
         taken = time.monotonic() - begun

@@ -19,6 +19,13 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.machines.own import is_here
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
+COPY_HINT = "copy the directory of the dataflow to that machine"
+
+
+def format_other_file(path: str) -> str:
+    """Why a member refuses its part if its descriptor is not that of the head."""
+    return f"{path} is not the same file as on the head"
+
 
 def own_dataflow(options: RunnerOptions, dataflow: Dataflow) -> Dataflow:
     """The dataflow with this machine's nodes only."""

@@ -178,6 +178,21 @@ class Asked:
     by: str
 
 
+@dataclass(frozen=True)
+class Check:
+    """Head to member: could your part start again? digest: SHA-256 of the descriptor now, hex."""
+
+    digest: str
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Member to head: the answer to a Check. reason: why its part could not start again, or ""."""
+
+    reason: str = ""
+    hint: str = ""
+
+
 FromLink = Lost | Unreached | Taken
 Message = (
     Forwards
@@ -193,6 +208,8 @@ Message = (
     | StopPart
     | Stopping
     | Asked
+    | Check
+    | Checked
 )
 M = TypeVar("M", bound=Message)
 
@@ -212,6 +229,8 @@ _TYPES: Mapping[str, type[Any]] = {
     "stop": StopPart,
     "stopping": Stopping,
     "asked": Asked,
+    "check": Check,
+    "checked": Checked,
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 _NUMBERS = {"coordinator", "zenoh", "grace", "again", "version", "tries", "failed"}

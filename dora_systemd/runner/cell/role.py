@@ -3,7 +3,7 @@
 Alone is the cell of all others. The head and the members are in runner/machines/.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.dora.engine import Child
@@ -14,6 +14,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.life.events import NodeAsked
 from dora_systemd.decisions.life.states import Cell
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
@@ -28,10 +29,15 @@ if TYPE_CHECKING:
 
 
 class Alone:
-    """The cell of the only machine of its dataflow. options: of the runner."""
+    """The cell of the only machine of its dataflow.
+
+    options: of the runner. find_own_refusal: the error with which this machine would refuse to
+    start again.
+    """
 
     def __init__(self, options: RunnerOptions, this_life: Life) -> None:
         self.options, self.this_life = options, this_life
+        self.find_own_refusal: Callable[[], DoraSystemdError | None] = lambda: None
 
     @property
     def sessions(self) -> Mapping[str, Session]:
@@ -58,6 +64,10 @@ class Alone:
 
     def check(self, dataflow: Dataflow) -> None:
         """Raise DoraSystemdError for a dataflow that this machine would refuse at a start."""
+
+    async def find_refusal(self) -> DoraSystemdError | None:
+        """The error with which another machine would refuse to start again, or None."""
+        return None
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """The dataflow has been read, and its run begins. Raises DoraSystemdError."""

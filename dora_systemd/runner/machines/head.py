@@ -104,6 +104,11 @@ class Head(Shared):
         """Raise DoraSystemdError for a node that cannot run on its machine."""
         check_placed(self.options, dataflow)
 
+    async def find_refusal(self) -> DoraSystemdError | None:
+        """Have all members check their parts: one that is away, or differs, cannot start again."""
+        content = Path(self.options.dataflow).read_bytes()
+        return await self.roster.find_refusal(hashlib.sha256(content).hexdigest())
+
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Note what the members have to compare."""
         self.check(prepared.dataflow)

@@ -7,10 +7,11 @@ has been told is in memory only.
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.dora.preparation import Prepared
@@ -24,7 +25,12 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.machines.part import check_placed, launch_files
+from dora_systemd.decisions.machines.part import (
+    COPY_HINT,
+    check_placed,
+    format_other_file,
+    launch_files,
+)
 from dora_systemd.decisions.machines.programs import format_digests
 from dora_systemd.decisions.rights.node_rights import without_essential
 from dora_systemd.errors import DoraSystemdError
@@ -38,7 +44,7 @@ from dora_systemd.runner.machines.engine import NOISE, MemberEngine
 from dora_systemd.runner.machines.lines import Lines
 from dora_systemd.runner.machines.member_boot import MemberBoot, no_head
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
-from dora_systemd.runner.machines.programs import own_digests
+from dora_systemd.runner.machines.programs import own_digests, read_digests
 from dora_systemd.runner.machines.shared import Shared
 from dora_systemd.runner.machines.uses import Uses
 from dora_systemd.runner.nodes.nodes import Nodes
@@ -81,6 +87,7 @@ class Member(Shared):
         self._table = self._told = self._version = ""
         self._prepared: Prepared | None = None
         self._environment: Mapping[str, str] = {}
+        self._spawn: Callable[[str, Coroutine[Any, Any, None]], None] | None = None
         self._has_head = asyncio.Event()
         self.stops_by_head = False
         self.grace = INFINITY
@@ -120,6 +127,7 @@ class Member(Shared):
         pump.on_event = self._tell_hung
         dialogue = MemberDialogue(options, pump, dora, nodes, pipes)
         dialogue.begin(self, dora)
+        self._spawn = dialogue.spawn
         dialogue.spawn("hear the head", self._hear_head())
         dialogue.spawn("tell what its nodes run", self._tell_programs())
         return dialogue
@@ -186,9 +194,22 @@ class Member(Shared):
             self._push(life.HeadStops(now_us(), message.by or HEAD))
         if isinstance(message, wire.Asked) and message.what in (RESTART, STOP):
             self._push(life.NodeAsked(now_us(), message.node, message.what, message.by))
+        if isinstance(message, wire.Check) and self._spawn is not None:
+            self._spawn("check its part", self._answer_check(message.digest))
         if isinstance(message, wire.StopPart):
             self.grace = message.grace
             self._end_by_head("the head has lost another machine")
+
+    async def _answer_check(self, digest: str) -> None:
+        """Say whether this part could start again."""
+        error = await asyncio.to_thread(self._find_refusal, digest)
+        self.send(wire.Checked(error.message, error.hint) if error else wire.Checked())
+
+    def _find_refusal(self, digest: str) -> DoraSystemdError | None:
+        flow = Path(self.options.dataflow)
+        if read_digests(flow.parent, [flow.name]).get(flow.name) != digest:
+            return DoraSystemdError(format_other_file(self.options.dataflow), COPY_HINT)
+        return self.find_own_refusal()
 
     def _end_by_head(self, why: str) -> None:
         self.stops_by_head = True

@@ -4,6 +4,7 @@ Each member is a session at the head's socket, which the link to that machine be
 """
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -35,6 +36,9 @@ _HUNG = ("node-hung", "node-watchdog")
 _MOST_TAKEN = 4
 """Attempts in a row with ports that are taken on some machine."""
 _LONGEST = 300
+_LOOK_SECONDS = 0.02
+_CHECK_SECONDS = 30.0
+"""Time for a member to check its part: its dora may have to read the descriptor."""
 
 
 class Member:
@@ -43,7 +47,7 @@ class Member:
     lines: the talk with it, if there is one. work: dora's directory there, "" until it is ready.
     words: why it is not ready. table: of its nodes. has_left: its part has ended in peace.
     is_over: it has said that its part ends, and is not ready again in this talk. failed: attempts
-    in a row that came to nothing.
+    in a row that came to nothing. checked: its answer to the last Check, None until that comes.
     """
 
     def __init__(self) -> None:
@@ -53,11 +57,23 @@ class Member:
         self.table = CellStatus()
         self.has_left = self.is_over = False
         self.failed = 0
+        self.checked: wire.Checked | None = None
 
     @property
     def is_heard(self) -> bool:
         """Whether it is there now."""
         return self.lines is not None and self.lines.silent < _SILENT_BEATS
+
+
+def _refusal(name: str, member: Member) -> DoraSystemdError | None:
+    """Why a member could not start its part again, or None."""
+    if (told := member.checked) is not None:
+        reason, hint = short_line(told.reason, _LONGEST), short_line(told.hint, _LONGEST)
+        error = DoraSystemdError(f"machine {name}: {reason}", hint, ExitCode.BAD_INPUT)
+        return error if reason else None
+    reason = "it does not answer" if member.work else member.words
+    message = f"cannot reach machine {name}: {reason}"
+    return DoraSystemdError(message, "a start would wait for that machine", ExitCode.NO_HOST)
 
 
 class Roster:
@@ -132,6 +148,23 @@ class Roster:
         for one in self._members.values():
             if one.lines is not None:
                 one.lines.send(message)
+
+    async def find_refusal(
+        self, digest: str, seconds: float = _CHECK_SECONDS
+    ) -> DoraSystemdError | None:
+        """The error of the first member that could not start again, or does not say; or None.
+
+        digest: of the descriptor, see wire.Check.
+        """
+        for member in self._members.values():
+            member.checked = None
+        self.tell(wire.Check(digest))
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while any(one.checked is None and one.work for one in self._members.values()):
+                    await asyncio.sleep(_LOOK_SECONDS)
+        refusals = (_refusal(name, one) for name, one in self._members.items())
+        return next(filter(None, refusals), None)
 
     def has_heard(self, machine: str, event: life.NodeAsked) -> bool:
         """Whether the table of a machine says who has asked for what of its node."""
@@ -210,8 +243,8 @@ class Roster:
         elif isinstance(message, wire.Table):
             self._members[name].table = CellStatus.from_json(message.status)
             self._refresh_soon()
-        elif isinstance(message, wire.Programs | wire.Hung):
-            self._hear_of_nodes(name, message)
+        elif isinstance(message, wire.Programs | wire.Hung | wire.Checked):
+            self._hear_of_files_and_nodes(name, message)
         elif isinstance(message, wire.Refused):
             self._give_up(name, message, Cause.MACHINE_REFUSES)
         elif isinstance(message, wire.Ended):
@@ -224,9 +257,13 @@ class Roster:
         elif isinstance(message, wire.Taken):
             self._take_others(name, message)
 
-    def _hear_of_nodes(self, name: str, message: wire.Programs | wire.Hung) -> None:
+    def _hear_of_files_and_nodes(
+        self, name: str, message: wire.Programs | wire.Hung | wire.Checked
+    ) -> None:
         if isinstance(message, wire.Programs):
             self.on_programs(name, message.digests)
+        elif isinstance(message, wire.Checked):
+            self._members[name].checked = message
         else:
             self._hung(name, message)
 

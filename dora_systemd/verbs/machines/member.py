@@ -22,6 +22,7 @@ from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.host.addresses import is_own
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.machines.link_command import relay_command
+from dora_systemd.decisions.machines.part import COPY_HINT, format_other_file
 from dora_systemd.decisions.machines.wire import LEASE_SECONDS, Part, format_message
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -200,8 +201,7 @@ def _check_same(part: Part, plan: Plan) -> None:
         raise _refusal(f"it has dora-systemd {__version__}, the head has {there}", hint)
     path = plan.options.dataflow
     if hashlib.sha256(read_file(path).data).hexdigest() != part.digest:
-        hint = "copy the directory of the dataflow to that machine"
-        raise _refusal(f"{path} is not the same file as on the head", hint)
+        raise _refusal(format_other_file(path), COPY_HINT)
 
 
 def _start_transient(

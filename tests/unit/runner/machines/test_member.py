@@ -1,6 +1,7 @@
 """A member: what it says to the head, and what it does without one."""
 
 import asyncio
+import hashlib
 import subprocess
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
@@ -147,6 +148,34 @@ def test_another_version_of_dora_is_refused(tmp_path: Path) -> None:
         assert refused["reason"] == "it has dora 1.1.4, the head has 1.0.2"
         assert other.writer.is_closed
         assert isinstance(bench.heard()[0], life.HeadLost)
+
+    run(tmp_path, work)
+
+
+def test_whether_it_could_start_again(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        flow = tmp_path / "flow.yml"
+        flow.write_text("nodes: []")
+        bench.member.options = OPTIONS._replace(dataflow=str(flow))
+        digest = hashlib.sha256(flow.read_bytes()).hexdigest()
+
+        async def answer(digest: str) -> dict[str, Any]:
+            before = len(other.heard())
+            other.say(wire.Check(digest))
+            while len(other.heard()) == before:
+                await asyncio.sleep(0.001)
+            return other.heard()[-1]
+
+        assert await answer(digest) == {"type": "checked", "reason": "", "hint": ""}
+        broken = DoraSystemdError("src.py: line 1: invalid syntax")
+        bench.member.find_own_refusal = lambda: broken
+        assert (await answer(digest))["reason"] == broken.message
+        other_file = await answer("abcd")
+        assert other_file["reason"] == f"{flow} is not the same file as on the head"
+        assert other_file["hint"] == "copy the directory of the dataflow to that machine"
+        flow.unlink()
+        assert await answer(digest) == other_file
 
     run(tmp_path, work)
 

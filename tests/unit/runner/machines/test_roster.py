@@ -15,6 +15,7 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.machines import wire
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.machines.roster import Roster
 from tests.unit.fakes.ends import FakeEnds
 from tests.unit.fakes.loop import live
@@ -53,6 +54,36 @@ async def settle() -> None:
 
 def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
     live(lambda: work(Bench()))
+
+
+def test_whether_all_could_start_again() -> None:
+    async def work(bench: Bench) -> None:
+        gone = await bench.roster.find_refusal("cdef")
+        assert gone is not None
+        assert gone.message == "cannot reach machine gpu: it is not connected yet"
+        assert gone.code is ExitCode.NO_HOST
+        links = {machine: await bench.link(machine) for machine in ("gpu", "cam")}
+        for link in links.values():
+            link.say(READY)
+        await settle()
+
+        async def answers(gpu: wire.Checked, cam: wire.Checked) -> DoraSystemdError | None:
+            question = asyncio.create_task(bench.roster.find_refusal("cdef"))
+            await settle()
+            assert links["cam"].heard()[-1] == {"type": "check", "digest": "cdef"}
+            links["gpu"].say(gpu)
+            links["cam"].say(cam)
+            return await question
+
+        assert await answers(wire.Checked(), wire.Checked()) is None
+        other = await answers(wire.Checked(), wire.Checked("another file", "copy it"))
+        assert other is not None
+        assert (other.message, other.hint) == ("machine cam: another file", "copy it")
+        silent = await bench.roster.find_refusal("cdef", 0.01)
+        assert silent is not None
+        assert silent.message == "cannot reach machine gpu: it does not answer"
+
+    run(work)
 
 
 def test_a_new_table_is_shown_soon() -> None:
