@@ -31,6 +31,7 @@ LINES = 20
 _TIMELINE = 7
 _SIZE = re.compile("[1-9][0-9]{0,18}")
 _TITLE_WIDTH = 10
+_MILLISECOND = 1000
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 
 _GIVEN_UP = "systemd has stopped restarting it; doractl restart {name} resets the counter"
@@ -246,13 +247,14 @@ def _when(verdict: Verdict) -> str:
     if not verdict.at_us:
         return since
     lasted = verdict.at_us - verdict.began_us
-    words = f", {_span(lasted)} after its start" if verdict.began_us and lasted >= 0 else ""
+    is_told = verdict.began_us and lasted >= _MILLISECOND
+    words = f", {_span(lasted)} after its start" if is_told else ""
     return f"{zoned_time(verdict.at_us)}{words}"
 
 
 def _span(duration: int) -> str:
     """A duration in µs as text, in whole seconds from one second on."""
-    unit = SECOND if duration >= SECOND else 1000
+    unit = SECOND if duration >= SECOND else _MILLISECOND
     return format_duration(duration // unit * unit)
 
 
