@@ -104,8 +104,9 @@ class Pump:
 
     def _take(self, event: life.Event) -> None:
         before = self.cell
-        with self._guard("tell other machines"):
-            self.on_event(event)
+        if before.state is not State.ENDED:  # else one that always raises would do so for ever
+            with self._guard("tell other machines"):
+                self.on_event(event)
         actions = self._step(event)
         if self.cell is not before:
             with self._guard("show its state"):

@@ -33,15 +33,22 @@ class Heard(Pump):
 class Bench:
     """Each action can be taken; the events that come of it are in `heard`."""
 
-    def __init__(self, root: Path, state: State = State.RUNNING) -> None:
+    def __init__(
+        self,
+        root: Path,
+        state: State = State.RUNNING,
+        options: RunnerOptions = OPTIONS,
+        kind: type[Heard] = Heard,
+    ) -> None:
         self.calls: Calls = []
         self.pipes = FakePipes(self.calls)
         self.nodes = FakeNodes(root, self.pipes, self.calls)
         self.dora = FakeDora(self.calls)
         cell = Cell(2 * SECOND, 0, {"a": NodeStatus("running", 7)}, state, run="run")
-        self.pump = Heard(cell, Life("uuid"), CellPaths(root), self.nodes, self.pipes)
+        self.paths = CellPaths(root)
+        self.pump = kind(cell, Life("uuid"), self.paths, self.nodes, self.pipes)
         self.pump.heard, self.pump.calls = [], self.calls
-        self.dialogue = Dialogue(OPTIONS, self.pump, self.dora, self.nodes, self.pipes)
+        self.dialogue = Dialogue(options, self.pump, self.dora, self.nodes, self.pipes)
         self.actions = self.dialogue.actions(DESCRIPTOR, {"ADDED": "1"})
 
     def enter(self, state: State) -> None:

@@ -79,8 +79,7 @@ class FakeNodes(Nodes):
         self.calls.append(("listen", run))
 
     def adopt(self, node: str, pid: int, rights: Sequence[NodeRights] = ()) -> None:
-        assert not rights
-        self.calls.append(("adopt", node, pid))
+        self.calls.append(("adopt", node, pid, *rights))
 
     def clear(self, node: str, pid: int) -> None:
         self.calls.append(("clear", node, pid))

@@ -149,7 +149,9 @@ print("size", *os.get_terminal_size(0), flush=True)
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_us_is_one_to_the_program(number: signal.Signals) -> None:
-    script = "import signal\nsignal.signal(2, signal.SIG_DFL)\nprint('go')\nsignal.pause()"
+    # nohup(1), or a shell that starts this in the background, has it ignored.
+    default = f"signal.signal({number.value}, signal.SIG_DFL)"
+    script = f"import signal\n{default}\nprint('go')\nsignal.pause()"
     assert at_a_terminal(script, f"go=kill:{number.value}").status == 128 + number
 
 

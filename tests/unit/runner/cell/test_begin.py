@@ -1,12 +1,15 @@
 """What a cell begins with: its lock, and what its coordinator and daemon are told."""
 
 import os
+import pwd
 import sys
 from pathlib import Path
 
 import pytest
 
+from dora_systemd.adapters.cgroup.groups import SUPERVISOR, group_of
 from dora_systemd.adapters.dora.engine import Child
+from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -15,13 +18,16 @@ from dora_systemd.runner.cell.begin import (
     LIBEXEC,
     OPENSSL,
     daemon_variables,
+    enter_supervisor,
     leave_out_openssl,
     let_openssl_in,
     make_lock,
+    nodes_environment,
     read_token,
     start_coordinator,
     start_daemon,
 )
+from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.manager import options
 from tests.unit.fakes.programs import make_program
 
@@ -127,3 +133,47 @@ def test_what_is_no_dora(paths: CellPaths, tmp_path: Path) -> None:
     with pytest.raises(DoraSystemdError) as caught:
         start_coordinator(str(tmp_path / "missing"), paths, {})
     assert caught.value.code is ExitCode.NO_DORA
+
+
+def test_the_runner_moves_into_a_group_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As DelegateSubgroup= has it from systemd 254 on."""
+    mount = fake_cgroups(monkeypatch, tmp_path)
+    own = mount / group_of().lstrip("/")
+    own.mkdir(parents=True, exist_ok=True)
+    (own / SUPERVISOR).mkdir()
+    (own / SUPERVISOR / "cgroup.procs").touch()
+    if own.name == SUPERVISOR:
+        assert enter_supervisor() == own.parent
+    else:
+        assert enter_supervisor() == own
+        assert (own / SUPERVISOR / "cgroup.procs").read_text().strip() == "0"
+
+
+@pytest.mark.parametrize("home", [None, "/srv/home"])
+def test_nodes_have_what_a_prompt_has(monkeypatch: pytest.MonkeyPatch, home: str | None) -> None:
+    for name in ("PWD", "HOME", "RUNTIME_DIRECTORY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MINE", "yes")
+    if home:
+        monkeypatch.setenv("HOME", home)
+    found = nodes_environment("/srv/robot")
+    assert found["PWD"] == "/srv/robot"
+    assert found["MINE"] == "yes"
+    assert found["HOME"] == (home or pwd.getpwuid(os.getuid()).pw_dir)
+
+
+def test_cpus_of_a_node_are_told_where_no_cgroup_binds_it(paths: CellPaths, tmp_path: Path) -> None:
+    bound = options(node_limits=(parse_node_limits("a:cpus=0"),))
+    told = daemon_variables(bound, paths, tmp_path, {})["DORA_SYSTEMD_RIGHTS"]
+    assert told == "a /usr/bin/taskset -c 0\n* \n"
+    limited = options(node_limits=(parse_node_limits("a:memory=1G"),))
+    assert "DORA_SYSTEMD_RIGHTS" not in daemon_variables(limited, paths, tmp_path, {})
+
+
+def test_a_coordinator_takes_any_port(paths: CellPaths, tmp_path: Path) -> None:
+    dora = make_program(tmp_path / "dora", SAYS)
+    for _ in range(2):
+        end(start_coordinator(dora, paths, {"PATH": os.environ["PATH"]}))
+        assert "--port 0" in Path(f"{dora}.coordinator").read_text()

@@ -202,7 +202,8 @@ def test_a_coordinator_without_a_token(tmp_path: Path, monkeypatch: pytest.Monke
         bench.dialogue.read_coordinator("Listening on port 4711")
         (event,) = bench.heard
         assert isinstance(event, life.Failed)
-        assert "df /run" in event.error
+        assert event.what == "use the dora coordinator"
+        assert event.error == "it has written no token; df /run shows whether it is full"
 
     live(work)
 

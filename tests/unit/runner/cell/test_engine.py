@@ -231,6 +231,7 @@ class Coordinator:
     def __init__(self) -> None:
         self.answers: dict[str, list[Any]] = {}
         self.asked: list[str] = []
+        self.params: list[Any] = []
         self.events: list[str] = []
         self.silent: set[str] = set()
 
@@ -240,6 +241,7 @@ class Coordinator:
             params = frame["params"]
             name = params if isinstance(params, str) else next(iter(params))
             self.asked.append(name)
+            self.params.append(params)
             if name not in self.silent:
                 result = self.answers[name].pop(0)
                 await socket.send(json.dumps({"id": frame["id"], "result": result}))
@@ -313,6 +315,9 @@ def test_a_run_and_its_events(tmp_path: Path) -> None:
     async def work(engine: Engine) -> None:
         await engine.wait_joined()
         assert await engine.start_run({"nodes": []}, "robot") == RUN
+        start = dora.params[-1]["Start"]
+        assert (start["dataflow"], start["name"]) == ({"nodes": []}, "robot")
+        assert start["local_working_dir"] == str(CellPaths(tmp_path).work)
         with pytest.raises(DoraSystemdError, match="no such node"):
             await engine.start_run({"nodes": []}, "robot")
         await engine.read_events(RUN, lambda: heard.append(None), heard.append)

@@ -4,12 +4,16 @@ import asyncio
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from dora_systemd.decisions.cell.exits import Exit, exit_of
+from dora_systemd.decisions.cell.owed import PROBE, Owed
 from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Do
+from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.resources.oom import Oom, Owner
-from tests.unit.fakes.dialogue import Bench
+from dora_systemd.decisions.rights.node_rights import NodeRights
+from tests.unit.fakes.dialogue import OPTIONS, Bench
 from tests.unit.fakes.loop import live
 from tests.unit.fakes.run import Calls
 
@@ -101,5 +105,79 @@ def test_a_line_that_means_nothing(tmp_path: Path) -> None:
     async def work() -> None:
         bench = Bench(tmp_path)
         assert await hear(bench, "hello") == []
+
+    live(work)
+
+
+OWES = (Owed("a", "image", 2_000_000),)
+PROBE_NODE = f"{PROBE}a"
+
+
+def test_a_node_that_the_runner_has_added_is_none_of_the_dataflow(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, options=OPTIONS._replace(owes=OWES))
+        assert await hear(bench, EXITED.format("false"), PROBE_NODE) == []
+        done = await hear(bench, EXITED.format("false"))
+        assert done == [("push", "NodeExited"), ("forget", "a")]
+        bench = Bench(tmp_path)
+        done = await hear(bench, EXITED.format("false"), PROBE_NODE)
+        assert done == [("push", "NodeExited"), ("forget", PROBE_NODE)], "it is called so"
+
+    live(work)
+
+
+def test_the_result_has_only_nodes_of_the_dataflow(tmp_path: Path) -> None:
+    results = {"a": {"Ok": None}, PROBE_NODE: {"Ok": None}}
+    ended = {"DataflowStopped": {"result": {"node_results": results}}}
+
+    async def work() -> None:
+        bench = Bench(tmp_path, State.CLOSING, options=OPTIONS._replace(owes=OWES))
+        bench.dora.answers["Check"].append(ended)
+        assert await bench.do(Do.ASK_RESULT) == [life.ResultKnown(0, {"a": Exit()})]
+
+    live(work)
+
+
+def test_a_node_gets_its_rights_when_it_is_executed(tmp_path: Path) -> None:
+    rights = (NodeRights("a", nice=5),)
+
+    async def work() -> None:
+        bench = Bench(tmp_path, options=OPTIONS._replace(node_rights=rights))
+        done = await hear(bench, "spawned node with pid 8")
+        assert done == [("adopt", "a", 8, *rights), ("push", "NodeSpawned")]
+
+    live(work)
+
+
+@pytest.mark.parametrize("node", ["a", "b"])
+def test_the_end_of_an_essential_node_says_so(tmp_path: Path, node: str) -> None:
+    rights = (NodeRights("a", essential=True),)
+
+    async def work() -> None:
+        bench = Bench(tmp_path, options=OPTIONS._replace(node_rights=rights))
+        await hear(bench, EXITED.format("false"), node)
+        (event,) = bench.heard
+        assert isinstance(event, life.NodeExited)
+        assert event.is_essential == (node == "a")
+
+    live(work)
+
+
+def test_a_node_that_ends_well_has_nothing_to_clear(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        done = await hear(bench, "handling node stop with exit status Success (restart: true")
+        assert done == [("push", "NodeExited"), ("forget", "a")]
+        assert bench.heard == [life.NodeExited(0, "a", Exit(), True)]
+
+    live(work)
+
+
+def test_what_is_said_of_a_node_that_is_not_in_the_table(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.nodes.living = {("new", 0)}
+        done = await hear(bench, EXITED.format("true"), "new")
+        assert done == [("push", "NodeExited"), ("forget", "new")]
 
     live(work)

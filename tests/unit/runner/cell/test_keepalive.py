@@ -38,3 +38,18 @@ def test_a_loop_that_hangs_is_not_alive() -> None:
     begun = asyncio.run(work())
     keepalive.end()
     assert not [one for one in sent if begun + 0.35 < one < begun + 1]
+
+
+def test_a_runner_that_exits_does_not_wait_for_it() -> None:
+    keepalive = Keepalive(0.01, lambda: None)
+
+    async def work() -> None:
+        task = asyncio.create_task(keepalive.beat())
+        await asyncio.sleep(0)
+        own = [one for one in threading.enumerate() if one.name == "keepalive"]
+        assert own
+        assert all(one.daemon for one in own)
+        task.cancel()
+
+    asyncio.run(work())
+    keepalive.end()

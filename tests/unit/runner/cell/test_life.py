@@ -10,7 +10,13 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.decisions.cell.restarts import RestartPolicy
-from dora_systemd.runner.cell.life import begin_life, is_first_life, learn_first
+from dora_systemd.runner.cell.life import (
+    Life,
+    begin_life,
+    is_first_life,
+    is_transient,
+    learn_first,
+)
 from dora_systemd.runner.cell.pause import age
 from dora_systemd.values import SECOND
 from tests.unit.fakes.manager import options
@@ -90,3 +96,47 @@ def test_no_thread_is_left_to_ask(learned: Learn, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(threading.Thread, "start", refuse)
     assert learned("enabled", 0) == (False, [])
+
+
+@pytest.mark.parametrize(
+    ("after", "is_first"),
+    [
+        (-POLICY.unit_delay / SECOND + 0.05, True),
+        (-POLICY.unit_delay / SECOND - 0.05, False),
+        (-0.02, True),
+        (0.05, False),
+    ],
+)
+def test_only_a_start_that_was_just_queued_is_the_first(
+    unit_file: Path, after: float, is_first: bool
+) -> None:
+    """systemd writes the file then, before the process begins; a restart comes after its delay."""
+    os.utime(unit_file, (time.time() - age() + after,) * 2)
+    assert is_first_life(POLICY, "robot", is_user=True) == is_first
+
+
+def test_a_life(monkeypatch: pytest.MonkeyPatch, unit_file: Path) -> None:
+    begun = begin_life(options("robot", restart=POLICY), is_user=True)
+    assert (begun.uuid, begun.is_first, begun.may_be_first) == (options().uuid, True, False)
+    assert begun.up_us == 0
+    begun.become_up()
+    first = begun.up_us
+    assert 0 < first <= time.monotonic_ns() // 1000
+    begun.become_up()
+    assert begun.up_us == first
+    unit_file.unlink()
+    later = begin_life(options("robot", restart=POLICY), is_user=True)
+    assert (later.is_first, later.may_be_first) == (False, True), "systemd knows"
+    monkeypatch.setenv("LISTEN_FDNAMES", "dora-life")
+    later = begin_life(options("robot", restart=POLICY), is_user=True)
+    assert (later.is_first, later.may_be_first) == (False, False)
+    plain = Life("uuid")
+    assert (plain.is_first, plain.may_be_first) == (False, False)
+
+
+def test_whose_unit_is_transient(unit_file: Path) -> None:
+    assert is_transient("robot", is_user=True)
+    assert not is_transient("other", is_user=True)
+    assert not is_transient("robot", is_user=False), "root's are in /run"
+    unit_file.unlink()
+    assert not is_transient("robot", is_user=True)

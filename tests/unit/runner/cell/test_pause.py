@@ -17,17 +17,20 @@ import pytest
 
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.restarts import RestartPolicy
+from dora_systemd.decisions.cell.restarts import HEAD_START, RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.pause import (
+    age,
     asked,
     find_spent,
     forget_restarts,
     hold_back,
     pause,
+    show,
 )
 from dora_systemd.values import INFINITY, SECOND
+from tests.unit.fakes.loop import live
 from tests.unit.fakes.programs import make_program
 
 DELAY = SECOND // 2
@@ -264,3 +267,58 @@ def test_a_table_that_cannot_be_written_makes_no_delay_shorter(unit: Unit) -> No
     unit.paths.status.mkdir()
     pauses = [round(0.1 + unit.start(restarts), 6) for restarts in range(5)]
     assert pauses == [0.1, 0.5, 1, 2, 4]
+
+
+def test_systemd_is_asked_when_the_last_life_has_ended(unit: Unit) -> None:
+    unit.start(0)
+    unit.old = 0.25
+    unit.start(0)
+    last = unit.asked.splitlines()[-1]
+    assert last == "show --value --property=ActiveExitTimestampMonotonic dora-robot.service"
+
+
+def test_a_process_that_is_as_old_as_the_delay_asks_nobody(unit: Unit) -> None:
+    unit.start(0)
+    unit.old = HEAD_START / SECOND
+    assert unit.start(0) == 0
+    assert not unit.asked
+
+
+def test_the_age_of_this_process() -> None:
+    command = ["ps", "-o", "etimes=", "-p", str(os.getpid())]
+    seconds = int(subprocess.run(command, capture_output=True, check=True).stdout)
+    assert abs(age() - seconds) < 2
+
+
+def test_what_is_seen_while_a_restart_waits(unit: Unit) -> None:
+    """In whole seconds, and never less than it takes."""
+    begun = time.time_ns() // 1000
+    show("uuid", unit.paths, 0.2)
+    status = CellStatus.from_json(unit.paths.status.read_text())
+    assert (status.uuid, status.stage, status.text) == ("uuid", "restarting", "restarting in 1s")
+    assert 0.2 * SECOND <= status.started_us - begun < 20 * SECOND
+    assert unit.paths.status.stat().st_mode & 0o777 == 0o600
+    show("uuid", unit.paths, 2.0)
+    assert CellStatus.from_json(unit.paths.status.read_text()).text == "restarting in 2s"
+    show("uuid", unit.paths, 61.000001)
+    text = CellStatus.from_json(unit.paths.status.read_text()).text
+    assert text == "restarting in 1min 2s"
+
+
+@pytest.mark.parametrize(
+    "policy", [RestartPolicy("no", window=1), POLICY._replace(window=INFINITY)]
+)
+def test_what_never_restarts_or_never_forgets_does_not_wait(
+    unit: Unit, policy: RestartPolicy
+) -> None:
+    unit.start(0)
+    counted = unit.store["dora-life"]
+
+    async def work() -> None:
+        begun = asyncio.get_running_loop().time()
+        await forget_restarts(unit.options(policy))
+        assert asyncio.get_running_loop().time() == begun
+
+    live(work)
+    unit.keep_store()
+    assert unit.store["dora-life"] == counted
