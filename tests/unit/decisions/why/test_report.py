@@ -79,7 +79,7 @@ robot: Failed
   Memory:   peak 300M, limit 200M, held 1M
   Starved:  detector, plot
   Restarts: camera 2 (exit code 1), dataflow 1 (gone)
-  Budget:   1/5 restarts used, resets in 1min
+  Budget:   1/5 restarts of the dataflow used, resets in 1min
   Inhibit:  node arm (PID 231, user dora, python arm.py): it moves
   Before:   stopped by root (2026-01-15 12:59:59 UTC)
   Unit:     dora-robot.service ({UUID})
@@ -180,7 +180,7 @@ def test_whose_memory_it_was(details: dict[str, str], words: str | None) -> None
 def test_the_budget_is_told_while_a_restart_may_come(status: str, used: int, is_told: bool) -> None:
     budget = {"used": used, "max": 5, "next_us": None, "resets_us": None}
     found = facts(replace(VERDICT, status=status), budget=budget)
-    assert found.get("Budget") == (f"{used}/5 restarts used" if is_told else None)
+    assert found.get("Budget") == (f"{used}/5 restarts of the dataflow used" if is_told else None)
     assert "Budget" not in facts(replace(VERDICT, status=status), budget=None)
 
 
@@ -288,7 +288,17 @@ AWAY = "camera stays down until doractl restart robot; the other nodes keep runn
 @pytest.mark.parametrize(
     ("verdict", "lines"),
     [
-        (PASSING, ["nothing: dora restarts camera automatically"]),
+        (
+            replace(PASSING, restarts=()),
+            ["nothing: dora restarts camera automatically"],
+        ),
+        (
+            replace(PASSING, cause=Cause.NODE_HUNG, details={}),
+            [
+                "find out what camera waited for, or raise health_check_timeout: in its YAML",
+                "dora restarts camera automatically, and so finds it fixed",
+            ],
+        ),
         (DEGRADED, ["fix camera, then run: doractl restart robot", AWAY]),
         (
             replace(OF_MACHINE, policy="always"),
