@@ -152,6 +152,9 @@ def test_a_cable_is_out(flow: Flow, how: str) -> None:
         wait_for("the head knows", lambda: "waiting for machine" in flow.status(), 15)
         assert time.monotonic() - begun < bound(15)
         assert "gpu" in flow.status()
+        refused = flow.cell.doractl("restart", NAME, check=False)
+        assert refused.stderr.startswith("doractl: cannot reach machine gpu: ")
+        assert f"doractl restart --force {NAME} restarts it anyway" in refused.stderr
     assert nothing_on("b") or flow.life() != life
     flow.wait_again(life)
     assert flow.cell.show("NRestarts") == "0"
@@ -161,9 +164,6 @@ def test_a_cable_is_out(flow: Flow, how: str) -> None:
 @lost
 def test_a_stop_while_a_machine_is_away(flow: Flow) -> None:
     with cable("b", "mute"):
-        refused = flow.cell.doractl("restart", NAME, check=False)
-        assert "cannot reach machine gpu: " in refused.stderr
-        assert "--force" in refused.stderr
         begun = time.monotonic()
         done = flow.cell.doractl("stop", NAME)
         taken = time.monotonic() - begun
