@@ -1,6 +1,7 @@
 """The nodes' pipes, with real FIFOs and a socket of our own."""
 
 import asyncio
+import contextlib
 import os
 import socket
 import stat
@@ -9,7 +10,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from dora_systemd.adapters.journal.socket import JournalSocket
-from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.adapters.logs.pipes import DRAIN_LIMIT, LogPipes
+from dora_systemd.adapters.logs.source import PIPE_SIZE, fifos
 from dora_systemd.decisions.cell.counters import WHOLE_CELL, LineCount
 from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.logs.lines import Origin
@@ -333,5 +335,100 @@ def test_what_systemd_keeps_of_a_node_goes_with_it(tmp_path: Path) -> None:
         pipes.forget("a")
         assert kept == ["a"], "released by name, once"
         pipes.close(0.1)
+
+    run(tmp_path, scenario)
+
+
+def test_nothing_stays_of_a_node_that_does_not_come_back(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.node("b")
+        path = cell.paths.node_stdout("a")
+        cell.write(path, b"last")
+        cell.pipes.forget("a")
+        assert await cell.messages(1) == ["last"]
+        assert {one.name.split(".")[0] for one in path.parent.iterdir()} == {
+            one.name.split(".")[0] for one in fifos("b", cell.paths).values()
+        }
+        assert list(cell.pipes.line_counts()) == ["", "b"]
+        cell.node("a")
+        cell.write(path, b"again\n")
+        assert await cell.messages(1) == ["again"]
+
+    run(tmp_path, scenario)
+
+
+def test_whose_end_was_asked_for_is_not_told_by_the_daemon(tmp_path: Path) -> None:
+    line = "2026-11-20T22:11:40.6Z ERROR run: node_failure: dora_daemon::x: bad node_id={} x\n"
+
+    async def scenario(cell: Cell) -> None:
+        reader, writer = os.pipe()
+        cell.pipes.add_output("daemon", reader)
+        cell.pipes.write_event("node-asked", "a", asked="stop", by="eve")
+        assert await cell.messages(1) == ["Node a: stop requested by eve"]
+        os.write(writer, line.format("a").encode() + line.format("b").encode())
+        (entry,) = await cell.entries(1)
+        assert "node_id=b" in entry["MESSAGE"]
+        cell.pipes.write_event("node-ready", "a")
+        os.write(writer, line.format("a").encode())
+        messages = await cell.messages(2)
+        assert "node_id=a" in messages[1]
+        os.close(writer)
+
+    run(tmp_path, scenario)
+
+
+def test_which_lines_of_children_are_no_records(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        outputs = {label: os.pipe() for label in ("daemon", "coordinator")}
+        lines: list[str] = []
+        for label, (reader, _) in outputs.items():
+            cell.pipes.add_output(label, reader, lines.append)
+        cell.pipes.mute("daemon")
+        cell.pipes.left_out = (b"known",)
+        for _, writer in outputs.values():
+            os.write(writer, b"2026-11-20T22:11:40.6Z ERROR a known one\n")
+            os.write(writer, b"2026-11-20T22:11:40.6Z ERROR another\n")
+        (entry,) = await cell.entries(1)
+        assert (entry["DORA_NODE"], entry["MESSAGE"]) == ("coordinator", "another")
+        await cell.until(lambda: len(lines) == 4)
+        cell.pipes.mute()
+        os.write(outputs["daemon"][1], b"2026-11-20T22:11:40.6Z ERROR late")
+        for _, writer in outputs.values():
+            os.close(writer)
+        (entry,) = await cell.entries(1)
+        assert (entry["DORA_NODE"], entry["MESSAGE"]) == ("daemon", "late")
+
+    run(tmp_path, scenario)
+
+
+def test_the_process_of_a_line_is_known_before_dora_tells_it(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.paths.node_pid("a").write_text("4711\n")
+        cell.write(cell.paths.node_stdout("a"), b"1\n")
+        (entry,) = await cell.entries(1)
+        assert entry["DORA_NODE_PID"] == "4711"
+        cell.paths.node_pid("a").write_text("no number")
+        cell.pipes.set_pid("a", 0)
+        cell.write(cell.paths.node_stdout("a"), b"2\n")
+        (entry,) = await cell.entries(1)
+        assert (entry["MESSAGE"], entry.get("DORA_NODE_PID")) == ("2", None)
+
+    run(tmp_path, scenario)
+
+
+def test_a_drain_reads_no_more_than_it_may_keep(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.server.close()
+        (tmp_path / "socket").unlink()
+        fd, written = os.open(cell.paths.node_stdout("a"), os.O_WRONLY | os.O_NONBLOCK), 0
+        with contextlib.suppress(BlockingIOError):  # the rest stays in the pipe
+            for _ in range(99):
+                written += os.write(fd, b"x\n" * 4096)
+                cell.pipes.drain("a", is_live=True)
+        assert DRAIN_LIMIT <= written <= DRAIN_LIMIT + 2 * PIPE_SIZE
+        os.close(fd)
 
     run(tmp_path, scenario)

@@ -147,3 +147,64 @@ def test_any_history(steps: list[tuple[str, str, int]]) -> None:
         before = put[: put.index(event)]
         assert set(before) <= set(taken[: taken.index(event)])
     assert not case.paused
+
+
+def test_lanes_take_turns(case: Case) -> None:
+    """Or the first one would have all the room that comes."""
+    for node in "abc":
+        case.put(node, [node.encode()] * 9)
+    for _ in range(4):
+        case.journal.make_room(1)
+    assert case.journal.taken == [b"a", b"b", b"c", b"a"]
+
+
+class Separate(SlowJournal):
+    """Leaves the last place to entries that are of no flood."""
+
+    def send_bulk(self, entry: bytes) -> bool:
+        return self.room > 1 and self.send(entry)
+
+
+def test_a_flood_leaves_room_for_others(loop: asyncio.AbstractEventLoop) -> None:
+    journal = Separate()
+    journal.room = 3
+    queue = LogQueue(loop, journal, lambda _: None, lambda _: None)
+    queue.put("flood", lambda: [b"1", b"2", b"3"], is_flood=True)
+    queue.put("quiet", lambda: [b"q"])
+    assert journal.taken == [b"1", b"2", b"q"]
+    assert (queue.waiting("flood"), queue.waiting("quiet")) == (1, 0)
+
+
+def test_a_lane_without_records_takes_as_many_again(loop: asyncio.AbstractEventLoop) -> None:
+    case = Case(loop, max_records=2)
+    for _ in range(3):
+        case.queue.put_record("a", b"x")
+    case.journal.make_room(9)
+    assert case.queue.take_lost() == 1
+    case.journal.room = 0
+    for _ in range(3):
+        case.queue.put_record("a", b"x")
+    assert (case.queue.take_lost(), case.queue.waiting("a")) == (1, 2)
+
+
+def test_what_is_given_up_is_counted(case: Case) -> None:
+    case.journal.room = 1
+    case.put("a", [b"1", b"2", b"3"])
+    case.put("a", [b"4", b"5"])
+    case.put("b", [b"6"])
+    case.queue.put_event(b"e")
+    assert not case.queue.is_empty
+    assert case.queue.give_up() == 6
+    assert (case.queue.give_up(), case.queue.is_empty) == (0, True)
+    assert case.journal.taken == [b"1"]
+
+
+def test_an_event_that_is_refused_is_sent_later(case: Case) -> None:
+    for entry in (b"1", b"2"):
+        case.queue.put_event(entry)
+    assert not case.queue.is_empty
+    case.journal.make_room(1)
+    assert case.journal.taken == [b"1"]
+    case.journal.make_room(1)
+    assert case.journal.taken == [b"1", b"2"]
+    assert case.queue.is_empty
