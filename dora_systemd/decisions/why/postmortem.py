@@ -208,9 +208,7 @@ def _own(crashes: Sequence[Happening], ends: Mapping[str, str]) -> Sequence[Happ
     """The crashes that no crash of another node has caused, or all if there are none."""
     victims = {node for node, how in ends.items() if parse_exit(how).by}
     own = [
-        one
-        for one in crashes
-        if one.node not in victims and not parse_exit(one.detail("exit")).by
+        one for one in crashes if one.node not in victims and not parse_exit(one.detail("exit")).by
     ]
     return own or crashes
 

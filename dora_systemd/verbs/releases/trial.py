@@ -34,19 +34,20 @@ class Standing:
     """What there is of a dataflow before its release changes.
 
     boot: its unit file. path: where that of a trial is. trial: the release on trial, or "". cell:
-    what systemd has loaded.
+    what systemd has loaded. has_trial: whether the file of a trial was there.
     """
 
     boot: BootUnit
     path: Path
     trial: str
     cell: Cell | None
+    has_trial: bool
 
     @property
     def current(self) -> str:
         """The release that every start runs without that of the trial, or ""."""
         known = self.boot.options
-        if known is None and self.cell is not None and not self.path.exists():
+        if known is None and self.cell is not None and not self.has_trial:
             known = self.cell.options  # disabled while it ran
         return release_of(known.dataflow) if known else ""
 
@@ -81,8 +82,8 @@ def trial_options(scope: Scope, unit: str) -> RunnerOptions | None:
 def read_standing(manager: Manager, scope: Scope, unit: str) -> Standing:
     """What there is of the dataflow. Raises DoraSystemdError (NAME_IN_USE) for foreign units."""
     options = trial_options(scope, unit)
-    boot = read_boot_unit(manager, scope, unit)
-    standing = Standing(boot, trial_path(scope, unit), "", read_cell(manager, unit))
+    boot, path = read_boot_unit(manager, scope, unit), trial_path(scope, unit)
+    standing = Standing(boot, path, "", read_cell(manager, unit), path.exists())
     trial = release_of(options.dataflow) if options else ""
     # A deploy that was killed right after its commit has left the same text in both places.
     return standing if trial == standing.current else replace(standing, trial=trial)
