@@ -89,8 +89,7 @@ def test_the_end_of_an_unterminated_line_is_held(source: Source, pipe: Pipe, fif
 def test_lines_above_the_limit_are_neither_written_nor_kept(
     source: Source, pipe: Pipe, fifo: Path
 ) -> None:
-    assert source.limit is None
-    assert source.take_suppressed() == 0
+    assert (source.limit, source.take_suppressed()) == (None, 0)
     assert source.admit("stdout", 7, 0.0) == 7
     source.limiter = LineLimiter(RateLimit(2, SECOND))
     assert source.limit == RateLimit(2, SECOND)
