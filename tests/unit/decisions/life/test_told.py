@@ -644,3 +644,43 @@ def test_the_table_begins_with_what_the_descriptor_says(
 )
 def test_when_systemd_is_told_that_it_is_ready(before: Cell, is_ready: bool) -> None:
     assert is_up(before) == is_ready
+
+
+def test_a_node_that_is_not_in_the_table_has_not_waited() -> None:
+    told = update({"a": RUNS}, life.NodeMet(1, "x"), is_stopping=False, is_open=True)
+    assert told == ({"a": RUNS}, ())
+
+
+@pytest.mark.parametrize("state", [State.BOOTING, State.JOINING, State.STARTING])
+def test_a_stop_before_the_nodes_run(state: State) -> None:
+    after, actions = step(cell(state), life.StopAsked(1, "SIGTERM"))
+    assert (after.state, after.stop_by, format_status(after)) == (State.ENDED, "SIGTERM", "stopped")
+    assert [one.event for one in records_of(actions)] == ["dataflow-stopping", "dataflow-stopped"]
+
+
+@pytest.mark.parametrize(
+    ("cause", "code"),
+    [
+        (Cause.REFUSED, RunnerExit.FAILED),
+        (Cause.NO_MACHINE, RunnerExit.NO_MACHINE),
+        (Cause.MACHINE_REFUSES, RunnerExit.BAD_DATAFLOW),
+    ],
+)
+def test_a_refusal_is_told_as_it_was_said(cause: Cause, code: RunnerExit) -> None:
+    after, actions = step(cell(State.STARTING), life.Refused(1, "no such operator", cause))
+    assert (after.failure, after.exit, after.cause) == ("no such operator", code, cause)
+    details = {"reason": "no such operator", "cause": str(cause)}
+    assert records_of(actions)[-1] == Record("dataflow-failed", "", details)
+
+
+def test_a_stop_while_a_failed_node_ends_all_leaves_no_failure() -> None:
+    """Who stops it does not want to hear of that."""
+    failing = cell(State.LEAVING, failure="x", exit=RunnerExit.FAILED, stop_by="SIGTERM")
+    after, _ = step(failing, life.ChildExited(1, "daemon", Exit()))
+    assert (after.failure, after.exit, format_status(after)) == ("", RunnerExit.OK, "stopped")
+
+
+def test_what_a_start_waits_for() -> None:
+    waits = WAITS._replace(since_us=0)
+    text = format_status(cell(State.WAITING, nodes={"a": RUNS._replace(state="ready"), "b": waits}))
+    assert text.startswith("1/2 nodes ready; b waits for /dev/x")
