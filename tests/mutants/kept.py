@@ -26,6 +26,11 @@ KEPT = (
     Kept("trust/terminals", r"TIOCSCTTY, \)", "0 is the argument if none is given, see fcntl"),
     Kept("", r"file=sys\.stderr, flush=False", "Python writes standard error line by line"),
     Kept("decisions/life/table", r"keys\(\) < ", "no state handles all events itself"),
+    Kept(
+        "decisions/why/nodes",
+        r'NodeRow\(node, (None|"XXXX"), restarts=0\)\)\._replace',
+        "the state is set there",
+    ),
     Kept("runner/cell/boot", r"self\._port = 0 ->", "its readers wait for the thread that sets it"),
     Kept("", r"self\._is_\w+ = False -> .* = None$", "it is only asked whether it is true"),
 )

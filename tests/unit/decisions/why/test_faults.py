@@ -1,5 +1,7 @@
 """What fails the trial of a release."""
 
+import pytest
+
 from dora_systemd.decisions.why.faults import Fault, find_fault, is_finished
 from dora_systemd.decisions.why.lives import Happening
 
@@ -42,3 +44,19 @@ def test_a_dataflow_may_finish() -> None:
     assert is_finished([finished])
     assert not is_finished([stopped, finished])
     assert not is_finished([])
+
+
+@pytest.mark.parametrize(
+    ("details", "text", "fault"),
+    [
+        ({"reason": "node a: x", "nodes": "a b"}, "failed", Fault("node a: x", "a")),
+        ({"reason": "gone"}, "failed", Fault("gone")),
+        ({"nodes": "a"}, "Dataflow robot failed", Fault("Dataflow robot failed", "a")),
+        ({}, "", Fault("dataflow-failed")),
+    ],
+)
+def test_the_failure_of_all_names_the_first_node(
+    details: dict[str, str], text: str, fault: Fault
+) -> None:
+    one = Happening("dataflow-failed", 20, "", text, "new", details=details)
+    assert find_fault([one], "") == fault

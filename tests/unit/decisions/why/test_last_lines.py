@@ -107,3 +107,15 @@ def test_a_full_file_system(line: str, told: str) -> None:
     subject = Subject("u", "robot", "dora-robot.service", "--system")
     report = Report(subject, Verdict("Failed", node="camera"), (Word(1, "camera", line),))
     assert told in remedies(report)[0]
+
+
+@pytest.mark.parametrize("target", ["dora_node_api::x", "zenoh::y"])
+def test_only_warnings_of_dora_come_last(target: str) -> None:
+    """Whatever its programs or its libraries say; a node may say as much as it likes."""
+    library = said("library", DORA_TARGET=target, PRIORITY="6")
+    own = said("own", DORA_TARGET="my::module", PRIORITY="6")
+    program = by_daemon("program", "6")
+    assert texts(own, library, most=1) == [("own", 1)]
+    assert texts(own, program, most=1) == [("own", 1)]
+    assert texts(own, program, said("b"), most=2) == [("own", 1), ("b", 1)]
+    assert texts(program, library, most=1) == [("library", 1)]

@@ -464,3 +464,9 @@ def test_a_number_that_is_none_is_null() -> None:
         "n_restarts": 3,
         "memory_peak_bytes": None,
     }
+
+
+def test_the_heading_of_the_last_lines_fits() -> None:
+    lines = format_report(replace(FULL, inhibitors=(), machines={}), 40).split("\n")
+    heading = next(line for line in lines if line.startswith("The last 2 lines"))
+    assert len(heading) <= 40

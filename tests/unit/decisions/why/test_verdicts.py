@@ -510,3 +510,17 @@ def test_the_remedy(verdict: Verdict, remedy: str) -> None:
 )
 def test_what_is_a_failure(verdict: Verdict, is_failure: bool, is_away: bool) -> None:
     assert (verdict.is_failure, verdict.is_away) == (is_failure, is_away)
+
+
+def test_what_an_ended_dataflow_has_to_say_of_itself() -> None:
+    """STATUS= of a unit stays after its end, and is about what was."""
+    assert judge(*RUNS, *STOPPED, facts=Facts("Stopped", "stopped")).now == ""
+    assert judge(*RUNS, facts=Facts("Running", "2/2 nodes running")).now == "2/2 nodes running"
+
+
+def test_when_memory_ended_it() -> None:
+    exited = unit("process-exited", EXIT_CODE="killed", EXIT_STATUS="9")
+    end = unit("unit-failed", UNIT_RESULT="signal")
+    verdict = judge(*RUNS, unit("unit-oom"), exited, end)
+    assert (verdict.cause, verdict.at_us) == (Cause.OUT_OF_MEMORY, 5)
+    assert verdict.details["unit_result"] == "signal"
