@@ -31,6 +31,7 @@ KEPT = (
         r'NodeRow\(node, (None|"XXXX"), restarts=0\)\)\._replace',
         "the state is set there",
     ),
+    Kept("runner/cell/begin", '"XXHOMEXX" not in', "a HOME that is set stays, see with_place()"),
     Kept("runner/cell/boot", r"self\._port = 0 ->", "its readers wait for the thread that sets it"),
     Kept("", r"self\._is_\w+ = False -> .* = None$", "it is only asked whether it is true"),
 )

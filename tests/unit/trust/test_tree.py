@@ -14,8 +14,8 @@ pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root has files o
 
 @pytest.fixture
 def project() -> Iterator[Path]:
-    """A directory of root, and so is all of the way to it."""
-    with TemporaryDirectory(dir="/var/lib", prefix="dora-systemd-") as directory:
+    """A directory that only root can replace, with all of the way to it."""
+    with TemporaryDirectory(dir="/var/tmp", prefix="dora-systemd-") as directory:
         place = Path(directory, "robot")
         (place / "models").mkdir(parents=True)
         (place / "a.py").write_text("")

@@ -1,6 +1,7 @@
 """What each step of the pump is called when it cannot be done, and what the journal is told."""
 
 import asyncio
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Do, RunnerExit, State
@@ -184,5 +186,16 @@ def test_an_event_that_changes_nothing_is_not_published(tmp_path: Path) -> None:
         bench.pump.cell = replace(bench.pump.cell, notice="x")
         bench.push(life.ReloadNoted(1, "y"))
         assert bench.paths.status.exists()
+
+    live(work)
+
+
+def test_a_sample_has_the_time_of_the_clock_that_never_jumps(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.RUNNING)
+        begun = time.monotonic_ns() // 1000
+        bench.pump.sample()
+        (sample,) = CellStatus.from_json(bench.paths.status.read_text()).samples
+        assert begun <= sample.at_us <= time.monotonic_ns() // 1000
 
     live(work)
