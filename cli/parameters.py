@@ -122,6 +122,12 @@ def duration_option(flag: str, text: str, default: str = "infinity") -> Callable
     return click.option(flag, metavar="TIME", default=default, callback=callback, help=text)
 
 
+waiting_option = click.option(
+    "--allow-waiting",
+    is_flag=True,
+    help="Let nodes wait for what they need, such as a device that is not plugged in.",
+)
+"""For what has a trial."""
 serial_option = click.option(
     "--serial",
     type=click.IntRange(min=1),

@@ -70,8 +70,11 @@ def test_a_release_has_what_its_build_makes(releases: Releases, project: Project
     assert int(line["_UID"]) != 0
     releases.check_whole()
     assert "Nothing differs" in releases.deploy(project.root, "--dry-run")
-    # The next one builds again, and shares what has become the same.
-    releases.deploy(project.root, *FAST)
+    # The same runs on; forced, the next one builds again, and shares what has become the same.
+    life = cell.show("InvocationID")
+    assert f"unchanged: release {first} runs\n" == releases.deploy(project.root, *FAST)
+    assert (cell.show("InvocationID"), releases.running()) == (life, first)
+    releases.deploy(project.root, *FAST, "--force")
     inodes = {(releases.path / one / "tree/made/a.py").stat().st_ino for one in releases.states()}
     assert len(inodes) == 1
     cell.doractl("rollback", cell.name)

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from functools import partial
 from typing import Any
 
 import click
@@ -18,6 +19,7 @@ from dora_systemd.cli.parameters import (
     print_outcomes,
     serial_option,
     tell,
+    waiting_option,
     wants_json,
 )
 from dora_systemd.cli.progress import open_progress, quiet_option
@@ -54,12 +56,13 @@ _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
 )
 @duration_option("--build-timeout", "Time that its build may take; default: 30min.", "30min")
 @click.option("--no-build", is_flag=True, help="Do not build; deploy what the project has.")
+@waiting_option
 @click.option("--no-enable", is_flag=True, help="Do not start it at every boot.")
 @serial_option
 @click.option("--from-stdin", is_flag=True, help="Read what deploy -H of another host sends.")
 @click.option("--dry-run", is_flag=True, help="Print what would change, and change nothing.")
 @quiet_option
-@inhibit_options
+@partial(inhibit_options, or_else=", or nothing has changed")
 @acting_options
 def command(
     dataflow: str,
@@ -68,6 +71,7 @@ def command(
     keep: int,
     build_timeout: int,
     no_build: bool,
+    allow_waiting: bool,
     no_enable: bool,
     serial: int,
     from_stdin: bool,
@@ -84,6 +88,8 @@ def command(
     The release is on trial until all nodes are ready and no node has failed for a while. Then it is
     what every start and boot runs. If it fails, what ran before runs again, and the exit status is
     11. A reboot during the trial boots what ran before. Refused while a lock inhibits it.
+
+    If neither the project nor a setting has changed since the release that runs, that runs on.
 
     With -H, FILE is a project here: each host gets it by ssh, one after the other, until a host has
     rolled it back.
@@ -109,7 +115,7 @@ def command(
     if not build_timeout:
         raise DoraSystemdError("cannot build in no time", "give a --build-timeout", ExitCode.USAGE)
     how, build_timeout = if_inhibited(force, wait), 0 if no_build else build_timeout
-    request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout)
+    request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout, allow_waiting)
     with open_progress(is_quiet) as progress:
         warn = progress.warn
         if from_stdin:
@@ -129,6 +135,9 @@ def deployed_outcome(done: Deployed, how: str) -> Outcome:
     """What is printed for a release that runs. how: "deployed" or "rolled back"."""
     details = {"release": done.release or None, "former": done.former or None, "files": done.files}
     details |= {"size_bytes": done.size, "copied_bytes": done.copied}
+    if done.is_unchanged:
+        text = f"unchanged: release {done.release} runs"
+        return Outcome(done, text, is_news=False, details=details)
     lines = [
         f"Dataflow {how}: {done.uuid} ({done.name})",
         f"Release: {done.release or 'none, its trial has ended'}",

@@ -10,6 +10,7 @@ from dora_systemd.cli.parameters import (
     duration_option,
     print_outcomes,
     serial_option,
+    waiting_option,
 )
 from dora_systemd.cli.progress import open_progress, quiet_option
 from dora_systemd.cli.verbs.change.deploy import deployed_outcome
@@ -20,6 +21,7 @@ from dora_systemd.verbs.releases.rollback import roll_back
 @click.argument("selector")
 @click.argument("release", required=False, metavar="[RELEASE]")
 @duration_option("--soak", "Time without a fault that the release has to pass; default: 0s.", "0s")
+@waiting_option
 @serial_option
 @quiet_option
 @inhibit_options
@@ -28,6 +30,7 @@ def command(
     selector: str,
     release: str | None,
     soak: int,
+    allow_waiting: bool,
     serial: int,
     is_quiet: bool,
     force: bool,
@@ -48,5 +51,6 @@ def command(
     how = if_inhibited(force, wait)
     scope = current_scope()
     with open_progress(is_quiet) as progress:
-        done = roll_back(Bus(scope), scope, selector, release, soak, progress, how)
+        bus, may_wait = Bus(scope), allow_waiting
+        done = roll_back(bus, scope, selector, release, soak, progress, how, may_wait=may_wait)
     return print_outcomes([] if is_quiet else [deployed_outcome(done, "rolled back")])

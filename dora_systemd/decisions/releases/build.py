@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import PurePath
 
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.descriptor.nodes import Node
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.terminal_text import short_line, without_sequences
 
 LOCK = "uv.lock"
@@ -88,6 +88,17 @@ def has_builds(value: object) -> bool:
             return True
         left += one.values() if isinstance(one, Mapping) else one
     return False
+
+
+def is_moving(dataflow: Dataflow) -> bool:
+    """Whether the same files may build another program: of the newest commit of a repository.
+
+    A module is not looked into, and may name a repository.
+    """
+    return any(
+        node.kind is NodeKind.MODULE or (node.git and not {"rev", "tag"} & node.raw.keys())
+        for node in dataflow.nodes
+    )
 
 
 def lock_places(dataflow: str) -> tuple[str, ...]:

@@ -100,6 +100,11 @@ def touched(old: Mapping[str, Stored], new: Mapping[str, Stored]) -> dict[str, l
     }
 
 
+def of_project(files: Mapping[str, Stored]) -> dict[str, Stored]:
+    """The files of a release that its project had, and no build has made."""
+    return {path: one for path, one in files.items() if not one.is_built}
+
+
 def refusal(path: str, reason: str, hint: str) -> DoraSystemdError:
     """The error for a file of a project that is not copied."""
     return DoraSystemdError(f"cannot copy {shown(path)}: {reason}", hint, ExitCode.BAD_INPUT)

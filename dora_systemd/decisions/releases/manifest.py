@@ -18,7 +18,7 @@ class Manifest:
 
     dataflow: the path of its file in the tree. source: the project that it was copied from. user:
     User= of its nodes, "" in user scope. created_us: CLOCK_REALTIME µs. versions: by
-    name of the program.
+    name of the program. given: options of its deploy by name of the setting, as of given_texts().
     """
 
     id: str
@@ -31,6 +31,7 @@ class Manifest:
     created_us: int
     versions: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[str, Stored] = field(default_factory=dict)
+    given: Mapping[str, str | list[str]] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -53,9 +54,12 @@ def parse_manifest(text: str, path: str) -> Manifest:
             raise ValueError("schema")
         files = {one: parse_stored(stored) for one, stored in value.pop("files").items()}
         versions = {str(name): str(one) for name, one in value.pop("versions", {}).items()}
+        given = {str(name): _texts(one) for name, one in value.pop("given", {}).items()}
         created_us = _number(value.pop("created_us"))
         texts = {key: _text(one) for key, one in value.items()}
-        return Manifest(**texts, created_us=created_us, versions=versions, files=files)
+        return Manifest(
+            **texts, created_us=created_us, versions=versions, files=files, given=given
+        )
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         message = f"cannot use {shown(path)}: it does not describe a release"
         hint = "remove that release, or deploy again"
@@ -84,6 +88,10 @@ def _number(value: object) -> int:
     if type(value) is not int:
         raise TypeError(value)
     return value
+
+
+def _texts(value: object) -> str | list[str]:
+    return [_text(one) for one in value] if isinstance(value, list) else _text(value)
 
 
 def _text(value: object) -> str:

@@ -10,6 +10,7 @@ from dora_systemd.names import is_release_id
 
 DONE = {"deploy": "deployed", "rollback": "rolled back"}
 UNDONE = {"deploy": "rolled back", "rollback": "undone"}
+UNCHANGED = "unchanged"
 INHIBITED, UNREACHABLE, LOST = "inhibited", "unreachable", "lost"
 FAILED, NOT_TRIED = "failed", "not tried"
 _RELEASE_WIDTH = 24
@@ -50,7 +51,10 @@ def verdict_of(
     known = details if isinstance(details, dict) else {}
     texts = [known.get(key) for key in ("release", "former")]
     release, former = (one if isinstance(one, str) and is_release_id(one) else "" for one in texts)
-    return Verdict(host.text, _word(verb, end, error), release, former)
+    word = _word(verb, end, error)
+    if word == DONE[verb] and outcome.get("result") == UNCHANGED:
+        word = UNCHANGED
+    return Verdict(host.text, word, release, former)
 
 
 def _word(verb: str, end: End, error: DoraSystemdError | None) -> str:
@@ -85,7 +89,7 @@ def verdict_object(
 
 def may_go_on(verb: str, word: str) -> bool:
     """Whether the next hosts may get it: nothing speaks against the release."""
-    return word in (DONE[verb], INHIBITED, UNREACHABLE)
+    return word in (DONE[verb], UNCHANGED, INHIBITED, UNREACHABLE)
 
 
 def worst_status(statuses: Sequence[int]) -> int:
@@ -106,7 +110,8 @@ class Columns:
     """The table, a line at a time. width: of a terminal, None without one."""
 
     def __init__(self, verb: str, hosts: Sequence[str], width: int | None) -> None:
-        words = (DONE[verb], UNDONE[verb], INHIBITED, UNREACHABLE, LOST, FAILED, NOT_TRIED)
+        ends = (DONE[verb], UNDONE[verb], UNCHANGED)
+        words = (*ends, INHIBITED, UNREACHABLE, LOST, FAILED, NOT_TRIED)
         columns = [("HOST", *hosts), ("RESULT", *words), ("RELEASE",), ("BEFORE",)]
         widths = [max(map(len, column)) for column in columns]
         widths[2:] = [_RELEASE_WIDTH] * 2

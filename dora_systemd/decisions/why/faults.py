@@ -6,15 +6,16 @@ from typing import NamedTuple
 from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.why.lives import Happening
 
+WAITING = "node-waiting"
 FAULTS = (
     *("node-crashed", "node-ended", "node-oom", "node-hung", "node-watchdog", "node-silent"),
-    *("node-waiting", "node-restarted", "dataflow-oom"),
+    *(WAITING, "node-restarted", "dataflow-oom"),
     *("daemon-lost", "coordinator-lost", "dataflow-failed"),
 )
 ENDS = ("dataflow-finished", "dataflow-stopped")
 FAULT_IDS = tuple(EVENTS[name].message_id for name in (*FAULTS, *ENDS))
 """The MESSAGE_IDs that a trial looks for."""
-_HOW = {"node-watchdog": "hung, ", "node-waiting": "waits for "}
+_HOW = {"node-watchdog": "hung, ", WAITING: "waits for "}
 """What `why` and `list` say before the reason, where that is not the name of the event."""
 
 
@@ -39,14 +40,17 @@ class Fault(NamedTuple):
         return not (self.is_stop or self.is_outside)
 
 
-def find_fault(happenings: Sequence[Happening], before: str) -> Fault | None:
+def find_fault(
+    happenings: Sequence[Happening], before: str, may_wait: bool = False
+) -> Fault | None:
     """The first fault of a trial, None if there is none.
 
     happenings: of the trial, newest first. before: systemd's invocation id of what ran before,
-    which may still write about its own end.
+    which may still write about its own end. may_wait: a node that waits for what it needs is none.
     """
     own = (one for one in reversed(happenings) if one.invocation != before)
-    first = next((one for one in own if one.name in FAULTS), None)
+    faults = [one for one in FAULTS if not (may_wait and one == WAITING)]
+    first = next((one for one in own if one.name in faults), None)
     return _fault(first) if first else None
 
 

@@ -1,23 +1,27 @@
 """`doractl deploy`: copies a project into a release, and lets it prove itself."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked, unusable
 from dora_systemd.decisions.releases.choice import surplus
-from dora_systemd.decisions.releases.entries import Stored, touched
+from dora_systemd.decisions.releases.entries import of_project, touched
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.progress import checking, waiting
-from dora_systemd.decisions.unit.file import persistent_unit, runner_of
+from dora_systemd.decisions.settings.lost import lost_options
+from dora_systemd.decisions.settings.resolve import given_texts
+from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import unit_name
+from dora_systemd.names import settings_path, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import opened_project
-from dora_systemd.values import SECOND
+from dora_systemd.values import SECOND, shown
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.clean import clean
@@ -25,7 +29,7 @@ from dora_systemd.verbs.releases.copy import copy_project, newest, repository_ow
 from dora_systemd.verbs.releases.files import digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
 from dora_systemd.verbs.releases.past import read_past
-from dora_systemd.verbs.releases.soak import Tell
+from dora_systemd.verbs.releases.soak import Gate, Tell
 from dora_systemd.verbs.releases.source import (
     Source,
     find_source,
@@ -34,14 +38,15 @@ from dora_systemd.verbs.releases.source import (
     source_notes,
 )
 from dora_systemd.verbs.releases.trial import (
+    Standing,
     read_after_wait,
     read_standing,
     require_deployable,
 )
+from dora_systemd.verbs.releases.unchanged import find_unchanged, unit_text
 from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import check_plan
-from dora_systemd.verbs.start.enable import boot_target
-from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.plan import StartRequest, make_plan
 from dora_systemd.verbs.start.unit import plan_properties
 
 _COMMAND = "doractl deploy"
@@ -52,7 +57,8 @@ BUILD_TIMEOUT = 30 * 60 * SECOND
 class DeployRequest:
     """A deploy. start: as of `doractl start`; its dataflow may be a directory. soak: µs.
 
-    how: what to do while a lock inhibits it. build_timeout: µs; 0: without a build.
+    how: what to do while a lock inhibits it; FORCE also deploys what has not changed.
+    build_timeout: µs; 0: without a build. may_wait: as of Gate.
     """
 
     start: StartRequest
@@ -61,10 +67,14 @@ class DeployRequest:
     want_boot: bool
     how: IfInhibited = IfInhibited.REFUSE
     build_timeout: int = BUILD_TIMEOUT
+    may_wait: bool = False
 
 
 class Deployed(NamedTuple):
-    """A release that runs. size: bytes of its files; copied: of those that no other one has."""
+    """A release that runs. size: bytes of its files; copied: of those that no other one has.
+
+    is_unchanged: it ran before, and the project and the settings have not changed since.
+    """
 
     uuid: str
     name: str
@@ -74,6 +84,7 @@ class Deployed(NamedTuple):
     files: int
     size: int
     copied: int
+    is_unchanged: bool = False
 
 
 def compare(
@@ -87,13 +98,8 @@ def compare(
     last = present(manager, scope, store_of(scope, source.plan.options.name))
     with opened_project(source.root, account_of(source.plan.user)) as project:
         found, _ = find_files(project, source.named, repository_owners(source))
-        return last.id if last else "", touched(of_project(last), digests(project, found))
-
-
-def of_project(release: Manifest | None) -> dict[str, Stored]:
-    """The files of a release that its project had, and no build has made."""
-    files = release.files if release else {}
-    return {path: one for path, one in files.items() if not one.is_built}
+        known = of_project(last.files) if last else {}
+        return last.id if last else "", touched(known, digests(project, found))
 
 
 def present(manager: Manager, scope: Scope, store: Store) -> Manifest | None:
@@ -123,11 +129,15 @@ def deploy(
     require_deployable(manager, scope, standing)
     with locked(store):
         standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
+        if same := _find_same(manager, scope, source, store, standing, request):
+            prune(manager, scope, store, request.keep, same.id)
+            return _deployed(standing, same, 0, is_unchanged=True)
         require_uninhibited(
             scope, standing.running, "deploy", request.how, lambda text: tell(waiting(text))
         )
         standing = read_after_wait(manager, scope, standing, "deploy")
         clean(manager, store, standing)
+        former = present(manager, scope, store)
         copy = copy_project(manager, scope, source, store, standing, request.build_timeout, tell)
         release = copy.manifest.id
         try:
@@ -142,23 +152,47 @@ def deploy(
             raise
         options = runner_of(text)
         assert options is not None
-        for note in (*copy.notes, *source_notes(source, store.tree(release))):
+        lost = _lost_note(former, request.start, source)
+        for note in (*copy.notes, *source_notes(source, store.tree(release)), *lost):
             warn(note)
         standing = read_standing(manager, scope, standing.boot.unit)  # the copy took its time
         require_deployable(manager, scope, standing)
         how, want_boot = request.how, request.want_boot
         change = Change(release, text, options, request.soak, want_boot, "deploy", how, _COMMAND)
         try:
-            change_release(manager, scope, store, standing, change, tell)
+            gate = partial(Gate, may_wait=request.may_wait)
+            change_release(manager, scope, store, standing, change, tell, gate)
         except BaseException as error:
             if getattr(error, "code", None) is not ExitCode.ROLLED_BACK:
                 _remove_unused(manager, scope, store, release)
             raise
         finally:
             prune(manager, scope, store, request.keep, release)
-    manifest = copy.manifest
-    facts = (options.uuid, name, standing.boot.unit, release, standing.current)
-    return Deployed(*facts, len(manifest.files), manifest.size, copy.copied)
+    return _deployed(standing, copy.manifest, copy.copied)
+
+
+def _find_same(
+    manager: Manager,
+    scope: Scope,
+    source: Source,
+    store: Store,
+    standing: Standing,
+    request: DeployRequest,
+) -> Manifest | None:
+    """Find the release that runs, if the deploy would change nothing and is not forced."""
+    is_to_enable = request.want_boot and not standing.boot.is_enabled
+    if is_to_enable or request.how is IfInhibited.FORCE:
+        return None
+    return find_unchanged(manager, scope, source, store, standing, request.start)
+
+
+def _deployed(
+    standing: Standing, manifest: Manifest, copied: int, is_unchanged: bool = False
+) -> Deployed:
+    """Describe the release that runs. standing: of before."""
+    former = "" if is_unchanged else standing.current
+    facts = (manifest.uuid, manifest.name, standing.boot.unit, manifest.id, former)
+    return Deployed(*facts, len(manifest.files), manifest.size, copied, is_unchanged)
 
 
 def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) -> None:
@@ -199,11 +233,25 @@ def _unit_text(
     wanted = released(source, request.start, tree, manifest.uuid)
     plan = make_plan(scope, wanted)
     versions = {**manifest.versions, **check_plan(lambda: manager, plan)}
-    store.write_manifest(replace(manifest, versions={**versions, "systemd": manager.version()}))
+    versions |= {"systemd": manager.version()}
+    store.write_manifest(replace(manifest, versions=versions, given=_given(request.start)))
     properties, warnings = plan_properties(plan, manager)
     for warning in warnings:
         warn(warning)
-    return _persistent(manager, scope, plan, format_unit(properties))
+    return unit_text(manager, scope, plan, format_unit(properties))
+
+
+def _given(request: StartRequest) -> dict[str, str | list[str]]:
+    return given_texts(request.flags, request.environment, Path.cwd())
+
+
+def _lost_note(former: Manifest | None, request: StartRequest, source: Source) -> Iterator[str]:
+    """Warn of options of the last deploy that have no effect any more."""
+    settings = source.plan.settings
+    if former and (lost := lost_options(former.given, _given(request), settings)):
+        file = shown(Path(settings_path(source.dataflow)).name)
+        hint = f"give them again, or write them to {file}, to keep them"
+        yield f"options of release {former.id} are not given any more: {', '.join(lost)}; {hint}"
 
 
 def _at_source(
@@ -216,7 +264,3 @@ def _at_source(
         hint = "the build has to make it there"
     return DoraSystemdError(message, hint, error.code)
 
-
-def _persistent(manager: Manager, scope: Scope, plan: Plan, text: str) -> str:
-    target = boot_target(manager, scope)
-    return persistent_unit([text], plan.options, scope.is_user, target)

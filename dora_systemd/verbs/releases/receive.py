@@ -17,7 +17,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.incoming import Stream, incoming
 from dora_systemd.adapters.releases.store import Store, unusable
-from dora_systemd.decisions.releases.entries import Stored, touched
+from dora_systemd.decisions.releases.entries import Stored, of_project, touched
 from dora_systemd.decisions.releases.parcel import (
     MOST_HEAD,
     Parcel,
@@ -38,7 +38,6 @@ from dora_systemd.verbs.releases.deploy import (
     Deployed,
     DeployRequest,
     deploy,
-    of_project,
     present,
 )
 from dora_systemd.verbs.releases.listing import root_of, store_of
@@ -70,7 +69,7 @@ def compare_sent(
     """What a deploy would change, as compare(). Raises DoraSystemdError."""
     parcel = parse_parcel(stream.line(MOST_HEAD))
     last = present(manager, scope, store_of(scope, parcel.name))
-    return last.id if last else "", touched(of_project(last), parcel.files)
+    return last.id if last else "", touched(of_project(last.files) if last else {}, parcel.files)
 
 
 def receive(

@@ -1,5 +1,7 @@
 """`doractl rollback`: an older release proves itself once more, and takes the place of this one."""
 
+from functools import partial
+
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import ROLLED_BACK
@@ -20,7 +22,7 @@ from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
 from dora_systemd.verbs.releases.past import KILLED, note_fault, read_past
-from dora_systemd.verbs.releases.soak import Tell
+from dora_systemd.verbs.releases.soak import Gate, Tell
 from dora_systemd.verbs.releases.trial import (
     Standing,
     go_back,
@@ -42,11 +44,13 @@ def roll_back(
     tell: Tell,
     how: IfInhibited = IfInhibited.REFUSE,
     by: str = _COMMAND,
+    may_wait: bool = False,
 ) -> Deployed:
     """Run an older release. release: its id; None for the one before the present one.
 
     Without one before, ends a trial whose doractl was killed; the id of what runs then is "".
-    soak: µs. how: what to do while a lock inhibits it. by: as in note_request().
+    soak: µs. how: what to do while a lock inhibits it. by: as in note_request(). may_wait: as of
+    Gate.
 
     Raises DoraSystemdError: ROLLED_BACK if that release fails its trial, INHIBITED.
     """
@@ -73,7 +77,8 @@ def roll_back(
             _require_intact(store, manifest)
         # One that was disabled stays so.
         change = Change(chosen, text, options, soak, False, "rollback", how, by)
-        change_release(manager, scope, store, standing, change, tell)
+        gate = partial(Gate, may_wait=may_wait)
+        change_release(manager, scope, store, standing, change, tell, gate)
     facts = (options.uuid, store.name, standing.boot.unit, chosen, standing.current)
     return Deployed(*facts, len(manifest.files), manifest.size, 0)
 

@@ -16,7 +16,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.progress import Step, soaking, starting, stopping
-from dora_systemd.decisions.why.faults import FAULT_IDS, Fault, find_fault, is_finished
+from dora_systemd.decisions.why.faults import FAULT_IDS, WAITING, Fault, find_fault, is_finished
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
 from dora_systemd.decisions.why.lives import Happening, parse_happening
 from dora_systemd.errors import DoraSystemdError
@@ -69,7 +69,8 @@ def settle(
 class Gate:
     """The trial of a dataflow. options: of the release. tell: gets each step.
 
-    hear: as read_heard().
+    hear: as read_heard(). may_wait: nodes may wait for what they need, and nobody then waits for
+    what nodes owe.
     """
 
     def __init__(
@@ -79,7 +80,9 @@ class Gate:
         options: RunnerOptions,
         tell: Tell,
         hear: Callable[[Scope, str, Sequence[Owed]], Sequence[int]] = read_heard,
+        may_wait: bool = False,
     ) -> None:
+        self._may_wait = may_wait
         self._manager = manager
         self._scope = scope
         self._options = options
@@ -172,6 +175,8 @@ class Gate:
     def _unheard(self) -> Owed | None:
         """The owed output that the trial has to wait for the longest, if any has not come yet."""
         owes = self._options.owes
+        if self._may_wait and any(one.name == WAITING for one in self._happenings()):
+            return None
         pairs = zip(owes, self._hear(self._scope, self._options.name, owes), strict=True)
         late = (one for one, at in pairs if at < self._since_monotonic_us)
         return max(late, key=lambda one: one.first, default=None)
@@ -179,7 +184,7 @@ class Gate:
     def _end(self, state: str) -> Fault | None:
         """What its end means: a dataflow may finish, everything else is a fault."""
         found = self._happenings()
-        if fault := find_fault(found, self._before):
+        if fault := find_fault(found, self._before, self._may_wait):
             # The runner's own words have the number of restarts, and may name other nodes, too.
             words = failure_reason(self._manager, self._unit)
             is_same = words.startswith(f"node {fault.node}: ") and ", node " not in words
@@ -192,7 +197,7 @@ class Gate:
         return Fault(failure_reason(self._manager, self._unit))
 
     def _fault(self) -> Fault | None:
-        return find_fault(self._happenings(), self._before)
+        return find_fault(self._happenings(), self._before, self._may_wait)
 
     def _happenings(self) -> list[Happening]:
         """What the journal has of the trial, newest first."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import Node
+from dora_systemd.decisions.releases.build import is_moving
 from dora_systemd.decisions.releases.entries import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -26,8 +27,9 @@ class Source:
 
     plan: of a start from there. named: files that the dataflow names, relative to root. read: what
     the files say that decide what root does, None for one that is not there. dora, uv: the commands
-    that have something to build, "" otherwise. sent: from where another host has sent it, or "".
-    revision: of git, for one that was sent.
+    that have something to build, "" otherwise. is_moving: these may build another program from
+    the same files. sent: from where another host has sent it, or "". revision: of git, for one that
+    was sent.
     """
 
     root: str
@@ -37,6 +39,7 @@ class Source:
     read: Mapping[str, bytes | None]
     dora: str = ""
     uv: str = ""
+    is_moving: bool = False
     sent: str = ""
     revision: str = ""
 
@@ -82,7 +85,8 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
     builders = find_builders(plan, dataflow, root) if want_build else ("", "")
     if plan.missing and not any(builders):
         raise plan.missing
-    return Source(root, origin, plan, named, read, *builders)
+    moves = bool(builders[0]) and is_moving(dataflow)
+    return Source(root, origin, plan, named, read, *builders, is_moving=moves)
 
 
 def read_dataflow(request: StartRequest) -> tuple[Path, Text, Dataflow]:

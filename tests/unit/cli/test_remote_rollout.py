@@ -39,6 +39,8 @@ case $HOST in
     cut) echo '{"progress": {"stage": "soak"}}' >&2; exit 255;;
     lost) echo "client_loop: send disconnect: Broken pipe" >&2; exit 255;;
     mute) exec sleep 600;;
+    same) echo '{"schema": 1, "action": "deploy", "name": "robot", "result": "unchanged",'
+          echo '"details": {"release": "20261121T220012", "former": null}}'; exit 0;;
     slow) for one in 1 2 3 4; do echo '{"progress": {"stage": "build"}}' >&2; sleep 0.5; done;;
     busy) echo '{"error": {"message": "busy", "exit_status": 10}}' >&2; exit 10;;
     bad*) echo '{"error": {"message": "was rolled back: a", "exit_status": 11}}' >&2; exit 11;;
@@ -96,6 +98,12 @@ def test_each_host_gets_what_it_asks_for(capsys: Printed, asked: Path) -> None:
     parcel = parse_parcel(asked.with_name("doractl.head").read_bytes())
     assert (parcel.name, parcel.dataflow, parcel.directory) == ("robot", "dataflow.yml", None)
     assert set(parcel.files) == {"a.py", "dataflow.yml"}
+
+
+def test_a_host_where_that_release_runs_holds_up_nobody(capsys: Printed) -> None:
+    assert main.run(["deploy", "-H", "same,h2"]) == ExitCode.OK
+    rows, _ = table(capsys)
+    assert [row[:2] for row in rows] == [["same", "unchanged"], ["h2", "deployed"]]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.enabled import trial_path
+from dora_systemd.verbs.inhibit.guard import IfInhibited
 from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy
 from dora_systemd.verbs.releases.listing import read_releases, store_of
 from dora_systemd.verbs.start.plan import StartRequest
@@ -69,7 +70,12 @@ class Systemd(CheckingManager):
 
 
 class Bench:
-    """A project that is deployed again and again."""
+    """A project that is deployed again and again.
+
+    how: of its deploys; FORCE, since most tests deploy what has not changed.
+    """
+
+    how = IfInhibited.FORCE
 
     def __init__(self, root: Path) -> None:
         self.scope = ScopeIn(is_user=True, uid=os.geteuid(), root=root / "run")
@@ -104,7 +110,7 @@ class Bench:
         return deploy(self.manager, self.scope, self.request(keep, want_boot, **flags), tell, warn)
 
     def request(self, keep: int = 3, want_boot: bool = True, **flags: object) -> DeployRequest:
-        return DeployRequest(self.start(**flags), 0, keep, want_boot)
+        return DeployRequest(self.start(**flags), 0, keep, want_boot, self.how)
 
     @property
     def releases(self) -> dict[str, str]:

@@ -14,6 +14,7 @@ from dora_systemd.decisions.releases.build import (
     built_nodes,
     format_task,
     has_builds,
+    is_moving,
     is_output,
     lock_places,
     parse_task,
@@ -36,6 +37,23 @@ NODES: tuple[tuple[dict[str, Any], bool], ...] = (
 def test_which_nodes_are_built(node: dict[str, Any], is_built: bool) -> None:
     dataflow = parse_dataflow({"nodes": [{**node, "id": "a"}, {**PLAIN, "id": "b"}]}, "/x.yml")
     assert built_nodes(dataflow) == ["a"] * is_built
+
+
+@pytest.mark.parametrize(
+    ("node", "moves"),
+    [
+        (PLAIN, False),
+        ({**PLAIN, "build": "make"}, False),
+        ({**PLAIN, "git": "https://host/a"}, True),
+        ({**PLAIN, "git": "https://host/a", "branch": "main"}, True),
+        ({**PLAIN, "git": "https://host/a", "rev": "1234567"}, False),
+        ({**PLAIN, "git": "https://host/a", "tag": "v1"}, False),
+        ({"module": "m.yml"}, True),
+    ],
+)
+def test_what_may_build_another_program_next_time(node: dict[str, Any], moves: bool) -> None:
+    nodes = [{**PLAIN, "id": "b"}, {**node, "id": "a"}]
+    assert is_moving(parse_dataflow({"nodes": nodes}, "/x.yml")) == moves
 
 
 def test_modules_that_ask_for_a_build() -> None:

@@ -32,7 +32,7 @@ def test_a_first_deploy(bench: Bench) -> None:
     bench.write("a.py", "print()")
     done = bench.deploy()
     manifest = bench.store.manifest(done.release)
-    assert done == (manifest.uuid, "robot", UNIT, manifest.id, "", 2, 36, 36)
+    assert done == (manifest.uuid, "robot", UNIT, manifest.id, "", 2, 36, 36, False)
     assert len(manifest.uuid) == 36
     facts = (manifest.name, manifest.dataflow, manifest.source, manifest.user, manifest.revision)
     assert facts == ("robot", "dataflow.yml", str(bench.project), "", "")
@@ -68,7 +68,7 @@ def test_the_next_one_shares_what_is_the_same(bench: Bench) -> None:
     changes = {"added": ["b.py"], "changed": ["a.py"], "removed": []}
     assert compare(bench.manager, bench.scope, bench.start()) == (first.release, changes)
     second = bench.deploy()
-    assert second == (first.uuid, "robot", UNIT, second.release, first.release, 3, 37, 8)
+    assert second == (first.uuid, "robot", UNIT, second.release, first.release, 3, 37, 8, False)
     assert second.release > first.release
     trees = [bench.store.tree(one.release) for one in (first, second)]
     is_same = [(trees[0] / name).samefile(trees[1] / name) for name in ("dataflow.yml", "a.py")]
@@ -224,3 +224,27 @@ def test_an_absolute_link_to_a_file_of_the_project(bench: Bench) -> None:
     error = refused(bench)
     assert "an absolute path, which is outside of every release" in error.message
     assert "by a relative path" in error.hint
+
+
+def test_options_that_are_not_given_again_are_named(bench: Bench) -> None:
+    rates = ("20/1s", "a=10/1s")
+    flags = {"nice": "3", "exit_when_nodes_finish": False, "log_rate_limit": rates}
+    first = bench.deploy(env=("KEY=secret",), **flags)  # type: ignore[arg-type]
+    assert bench.store.manifest(first.release).given == {
+        **{"dora": bench.dora, "env": ["KEY=secret"], "exit_when_nodes_finish": "no"},
+        **{"nice": "3", "log_rate_limit": [*rates]},
+    }
+    assert bench.warnings == []
+    bench.write("dataflow.systemd.yml", "env: {KEY: other}\n")
+    bench.deploy(nice="4")
+    assert bench.warnings == [
+        f"options of release {first.release} are not given any more: "
+        "--no-exit-when-nodes-finish, --log-rate-limit 20/1s, --log-rate-limit a=10/1s; "
+        "give them again, or write them to dataflow.systemd.yml, to keep them"
+    ]
+    bench.deploy(nice="4")
+    assert bench.warnings == []
+    (bench.project / "dataflow.systemd.yml").unlink()
+    bench.deploy(nice="4", env=("KEY=secret",))
+    bench.deploy(nice="4")
+    assert [one.partition("any more: ")[2].partition(";")[0] for one in bench.warnings] == ["--env"]

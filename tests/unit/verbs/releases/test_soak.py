@@ -160,6 +160,30 @@ def record(event: str, **fields: str) -> dict[str, str]:
     return {**crash(1001), "DORA_EVENT": event, "DORA_NODE": "", "DORA_EXIT": "", **fields}
 
 
+@pytest.mark.parametrize("may_wait", [False, True])
+def test_a_node_may_wait_for_what_it_needs(
+    manager: FakeManager,
+    scope: Scope,
+    clock: list[float],
+    journal: FakeJournal,
+    may_wait: bool,
+) -> None:
+    """Then nobody waits for what nodes owe; another fault is one in any case."""
+    assert clock
+    manager.add(options(owes=(IMAGE,)), InvocationID=b"")
+    gate = Gate(
+        *(manager, scope, options(owes=(IMAGE,)), lambda _: None, lambda *_: (0,)),
+        may_wait=may_wait,
+    )
+    waits = record("node-waiting", DORA_NODE="camera", DORA_REASON="/dev/cam (not there)")
+    journal.write(waits)
+    found = gate._soak(2 * SECOND)
+    waiting = Fault("node camera: waits for /dev/cam (not there)", "camera")
+    assert found and found[:2] == waiting[:2] if not may_wait else found is None
+    journal.write(crash(1002))
+    assert (gate._fault() == CRASHED) or not may_wait
+
+
 WORDS = f"{FAILED_BECAUSE}node camera: exit code 1 after 2 restarts"
 CRASHED = Fault("node camera: exit code 1", "camera")
 STOPPED = Fault("it was stopped", is_stop=True)
