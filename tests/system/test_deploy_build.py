@@ -8,7 +8,7 @@ import sys
 import sysconfig
 import textwrap
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -216,12 +216,22 @@ ENTRY_POINTS = """
 robot-camera = robot_camera:main
 script = script_of_lab:main
 """
+
+
+def about(name: str) -> dict[str, str]:
+    """The files of a wheel that describe it."""
+    named = f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n"
+    return {
+        f"{name}-1.dist-info/METADATA": named,
+        f"{name}-1.dist-info/WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\n",
+    }
+
+
 WHEEL = {
     "robot_camera.py": "def main():\n" + textwrap.indent(USES_VENV, "    "),
     "script_of_lab.py": "import sys\ndef main():\n    print('script', sys.prefix)\n",
     "lab.pth": PACKAGES,
-    "robot_camera-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: robot-camera\nVersion: 1\n",
-    "robot_camera-1.dist-info/WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\n",
+    **about("robot_camera"),
     "robot_camera-1.dist-info/entry_points.txt": ENTRY_POINTS,
 }
 
@@ -230,12 +240,18 @@ def write_clone(project: Project) -> None:
     """A project with a locked package, which has its node, as git clones it: without .venv."""
     project.write("pyproject.toml", PYPROJECT)
     project.write("dataflow.yml", CLONE)
-    record = "robot_camera-1.dist-info/RECORD"
-    with zipfile.ZipFile(project.root / "robot_camera-1-py3-none-any.whl", "w") as wheel:
-        for path, text in WHEEL.items():
-            wheel.writestr(path, text)
-        wheel.writestr(record, "".join(f"{path},,\n" for path in (*WHEEL, record)))
+    write_wheel(project, "robot_camera", WHEEL)
+    write_wheel(project, "more", {"more.py": "", **about("more")})
     run("uv", "lock", "--offline", cwd=project.root)
+
+
+def write_wheel(project: Project, name: str, files: Mapping[str, str]) -> None:
+    """Write a package of these files into the project."""
+    record = f"{name}-1.dist-info/RECORD"
+    with zipfile.ZipFile(project.root / f"{name}-1-py3-none-any.whl", "w") as wheel:
+        for path, text in files.items():
+            wheel.writestr(path, text)
+        wheel.writestr(record, "".join(f"{path},,\n" for path in (*files, record)))
 
 
 @pytest.mark.warns("error")
@@ -243,11 +259,19 @@ def test_uv_sync_makes_the_virtual_environment_of_a_clone(
     releases: Releases, project: Project
 ) -> None:
     write_clone(project)
+    # An environment that uv has made has no pip.
+    wheel = "pip install --no-deps --no-index ./more-1-py3-none-any.whl"
+    project.write("dataflow.yml", CLONE.replace("50}}", f"50}}, build: {wheel}}}"))
     releases.deploy(project.root, *FAST)
     check_venv(releases)
     venv = releases.path / releases.current() / "tree/.venv"
     (compiled,) = venv.glob("lib/python3*/site-packages/__pycache__/robot_camera.*.pyc")
     assert compiled.read_bytes()[4] == 0b11  # valid by the source's content
+    assert list(venv.glob("lib/python3*/site-packages/more.py"))
+    # Releases share what is compiled, for their own path is not in it.
+    releases.deploy(project.root, *FAST, "--force")
+    both = [*releases.path.glob("*/tree/.venv/lib/python3*/**/robot_camera.*.pyc")]
+    assert (len(both), len({one.stat().st_ino for one in both})) == (2, 1)
     project.write("uv.lock", "[[")
     said = releases.deploy(project.root, "-q", status=5)
     assert "uv: Failed to parse `uv.lock`: TOML parse error" in said

@@ -18,10 +18,11 @@ _OF_NODE = re.compile(r"(?P<node>[\w.-]+): +(?P<level>stdout|stderr|[A-Z]+) +(?P
 _UV_ERROR = re.compile(r"^(?:error: | +× )", re.MULTILINE)
 _UV_CAUSE = re.compile(r"\n +(?:cause:|Caused by:|[├╰]─▶) *")
 _ALWAYS = {
-    # Bytecode is valid by its source's content, for the files get new times; and equal builds have
-    # equal files, which releases share. Python, pip and uv have this mode by this variable alone.
+    # Bytecode is valid by its source's content, for the files get new times. Python, pip and uv
+    # have this mode by this variable alone.
     "SOURCE_DATE_EPOCH": "315532800",
-    "UV_COMPILE_BYTECODE": "1",
+    # _COMPILE does that when all is there.
+    "UV_COMPILE_BYTECODE": "0",
     # The sandbox makes homes read-only, and a Python in one of them is no part of the release.
     "UV_NO_CACHE": "1",
     "UV_LINK_MODE": "copy",
@@ -31,6 +32,13 @@ _ALWAYS = {
     "PIP_NO_INPUT": "1",
     "GIT_TERMINAL_PROMPT": "0",
 }
+_COMPILE = (
+    '[ ! -x "$1/bin/python" ] || "$1/bin/python" -I -m compileall -qq -f -s "$2" '
+    '--invalidation-mode checked-hash "$1/lib"; true'
+)
+"""Compiles what is in a virtual environment: equal sources become equal files, which releases
+share, for the path of the release is not in them. Packages have files that no Python can compile.
+"""
 
 
 @dataclass(frozen=True)
@@ -107,31 +115,36 @@ def lock_places(dataflow: str) -> tuple[str, ...]:
 
 
 def build_commands(
-    files: Collection[str], place: str, dataflow: str, uv: str, dora: str
+    files: Collection[str], place: str, dataflow: str, uv: str, dora: str, venv: str | None = None
 ) -> tuple[tuple[str, ...], ...]:
     """The commands of a build.
 
     files: of the project, which is at `place` while it is built. dataflow: its path there. uv,
-    dora: paths of these commands, "" if there is nothing to do for them.
+    dora: paths of these commands, "" if there is nothing to do for them. venv: the virtual
+    environment that they may make, relative to `place`, or None.
     """
     lock = next((one for one in lock_places(dataflow) if one in files), None)
     sync = ("sync", "--frozen", "--directory", str(PurePath(place, lock or "").parent))
-    found = ((uv, *sync),) if uv and lock else ()
-    return (*found, (dora, "build", "--local", str(PurePath(place, dataflow)))) if dora else found
+    found: list[tuple[str, ...]] = [(uv, *sync)] if uv and lock else []
+    found += [(dora, "build", "--local", str(PurePath(place, dataflow)))] if dora else []
+    if found and venv is not None:
+        found.append(("/bin/sh", "-c", _COMPILE, "compile", str(PurePath(place, venv)), place))
+    return tuple(found)
 
 
 def build_environment(
-    given: Mapping[str, str], venv: str | None, former_venv: str | None
+    given: Mapping[str, str], venv: str | None, former_venv: str | None, more: str = ""
 ) -> dict[str, str]:
     """The variables of a build, from those of the nodes, which have precedence.
 
     venv: which the build may create, None for one that is given. former_venv: whose programs come
-    first on PATH otherwise.
+    first on PATH otherwise. more: a directory of programs that come after those of `venv`, or "".
     """
     if venv is None:
         return {**_ALWAYS, **given}
     path = given.get("PATH", "").removeprefix(f"{former_venv}/bin:")
-    own = {"PATH": f"{venv}/bin:{path}", "VIRTUAL_ENV": venv, "UV_PROJECT_ENVIRONMENT": venv}
+    first = f"{venv}/bin:{more}:" if more else f"{venv}/bin:"
+    own = {"PATH": first + path, "VIRTUAL_ENV": venv, "UV_PROJECT_ENVIRONMENT": venv}
     return {**_ALWAYS, **given, **own}
 
 

@@ -42,6 +42,7 @@ from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.check import beside_properties, exec_start
 
+_LIBEXEC = str(Path(__file__).parents[2] / "libexec/build")
 _LOOK_SECONDS = 0.2
 _GONE_SECONDS = 20.0
 _LATE_SECONDS = 30.0
@@ -221,12 +222,13 @@ def _sent(manager: Manager, build: Build, tree: BuildTree, reading: int) -> list
     task = BuildTask(plan.options.name, build.uuid, build.release, directory, commands)
     own = build.source.own_venv
     venv = None if own is None else str(place / own)
+    more = _LIBEXEC if build.source.uv else ""
     properties = build_properties(
         beside_properties(manager, plan),
         str(tree.tree),
         str(place),
         str(build.store.path.parent),
-        build_environment(plan.environment, venv, plan.options.venv),
+        build_environment(plan.environment, venv, plan.options.venv, more),
         build.timeout,
         build.scope.is_user,
     )

@@ -148,7 +148,8 @@ def _commands(
     if not (source.dora or source.uv):
         return ()
     place = str(store.tree(manifest.id))
-    return build_commands(found, place, source.dataflow, source.uv, source.dora)
+    uv, dora, venv = source.uv, source.dora, source.own_venv
+    return build_commands(found, place, source.dataflow, uv, dora, venv)
 
 
 def _fill(

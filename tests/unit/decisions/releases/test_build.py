@@ -1,6 +1,9 @@
 """What a build is, and what is made of its lines."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -78,6 +81,9 @@ def test_the_commands_and_their_order() -> None:
     assert found == ((*sync, "/r/tree"), dora)
     found = build_commands(["uv.lock", "flows/uv.lock"], "/r/tree", flow, "/bin/uv", "")
     assert found == ((*sync, "/r/tree/flows"),)
+    first, compiles = build_commands([], "/r/tree", flow, "", "/bin/dora", "flows/.venv")
+    assert (first, compiles[-2:]) == (dora, ("/r/tree/flows/.venv", "/r/tree"))
+    assert build_commands([], "/r/tree", flow, "", "", ".venv") == ()
 
 
 def test_the_environment() -> None:
@@ -86,7 +92,29 @@ def test_the_environment() -> None:
     assert found["PATH"] == "/r/tree/.venv/bin:/usr/bin"
     assert found["VIRTUAL_ENV"] == found["UV_PROJECT_ENVIRONMENT"] == "/r/tree/.venv"
     assert found["UV_NO_CACHE"] == "0"
+    found = build_environment(given, "/r/tree/.venv", "/p/.venv", "/own")
+    assert found["PATH"] == "/r/tree/.venv/bin:/own:/usr/bin"
     assert build_environment(given, None, "/p/.venv")["PATH"] == given["PATH"]
+
+
+def test_equal_sources_are_compiled_to_equal_files(tmp_path: Path) -> None:
+    """Wherever the release is; and what cannot be compiled is no failure."""
+    compiled = []
+    for place in (tmp_path / "first", tmp_path / "second one"):
+        packages = place / ".venv/lib/python3/site-packages"
+        packages.mkdir(parents=True)
+        (place / ".venv/bin").mkdir()
+        (place / ".venv/bin/python").symlink_to(sys.executable)
+        (packages / "a.py").write_text("def f(): return 1")
+        (packages / "bad.py").write_text("print 'two'")
+        *_, command = build_commands([], str(place), "x.yml", "", "/bin/dora", ".venv")
+        assert subprocess.run(command, check=False).returncode == 0
+        (made,) = (packages / "__pycache__").glob("*.pyc")
+        compiled.append(made.read_bytes())
+    assert compiled[0] == compiled[1]
+    assert compiled[0][4] == 0b11, "valid by the source's content"
+    *_, command = build_commands([], str(tmp_path), "x.yml", "", "/bin/dora", ".venv")
+    assert subprocess.run(command, check=False).returncode == 0, "the build has made none"
 
 
 LINES = {
