@@ -90,6 +90,13 @@ def test_a_release_goes_from_host_to_host(base: Releases, project: Project) -> N
     assert (tree / "a.py").read_text() == (project.root / "a.py").read_text()
     (hers,) = json.loads(doractl("-H", "arm", "list", "-o", "json").stdout)
     assert (hers["name"], hers["status"], hers["release"]) == (name, "Running", second[2])
+    # Code of bob does not become that of the user of root's dataflows.
+    flow = project.root / "dataflow.yml"
+    shutil.chown(flow, "bob")
+    refused = deploy(project, name, *FAST, "-H", "base")
+    assert (refused.returncode, "bob owns it" in refused.stderr) == (ExitCode.NO_PERMISSION, True)
+    assert "--uid USER" in refused.stderr
+    shutil.chown(flow, "root")
     # Nothing of the way is left.
     assert not list(STORE.glob(".sent*"))
     assert not list(HERS.glob(".sent*"))

@@ -39,7 +39,7 @@ class Parcel:
 
     source: its directory, there for people only. dataflow: the path of its file, relative to it.
     directory: the working directory, relative to it; None for that of the file. revision: of git,
-    or "".
+    or "". owner: the user whose files they are, "" for those of root and of who sends them.
     """
 
     name: str
@@ -48,6 +48,7 @@ class Parcel:
     directory: str | None
     revision: str
     files: Mapping[str, Stored] = field(default_factory=dict)
+    owner: str = ""
 
     @property
     def contents(self) -> list[Stored]:
@@ -79,7 +80,7 @@ def parse_parcel(line: bytes) -> Parcel:
 
 def _check_types(one: Parcel) -> None:
     """Raise ValueError or TypeError for what no project has."""
-    texts = (one.name, one.source, one.revision, one.dataflow, one.directory or ".")
+    texts = (one.name, one.source, one.revision, one.dataflow, one.directory or ".", one.owner)
     if not all(isinstance(text, str) and len(text) <= _MOST_SOURCE for text in texts):
         raise TypeError
     is_below = one.directory in (None, ".") or is_plain_path(one.directory or "")
@@ -87,7 +88,7 @@ def _check_types(one: Parcel) -> None:
         raise ValueError(one.dataflow)
     if one.revision and not is_revision(one.revision):
         raise ValueError(one.revision)
-    if not one.source.isprintable():
+    if not (one.source.isprintable() and one.owner.isprintable()):
         raise ValueError(one.source)
 
 

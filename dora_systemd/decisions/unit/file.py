@@ -118,6 +118,12 @@ def runner_of(text: str) -> RunnerOptions | None:
         return None
 
 
+def user_of(text: str) -> str:
+    """Read User= of a unit file, "" if it has none."""
+    values = [line.removeprefix("User=") for line in _logical_lines(text) if line[:5] == "User="]
+    return values[-1] if values else ""
+
+
 def says_the_same(text: str, other: str) -> bool:
     """Whether two unit files start the same dataflow in the same way, by whatever target.
 

@@ -15,7 +15,7 @@ from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.settings.lost import lost_options
 from dora_systemd.decisions.settings.resolve import given_texts
-from dora_systemd.decisions.unit.file import runner_of
+from dora_systemd.decisions.unit.file import runner_of, user_of
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path, unit_name
@@ -46,6 +46,7 @@ from dora_systemd.verbs.releases.trial import (
 from dora_systemd.verbs.releases.unchanged import find_unchanged, unit_text
 from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import check_plan
+from dora_systemd.verbs.start.claim import require_same_user
 from dora_systemd.verbs.start.plan import StartRequest, make_plan
 from dora_systemd.verbs.start.unit import plan_properties
 
@@ -129,6 +130,7 @@ def deploy(
     require_deployable(manager, scope, standing)
     with locked(store):
         standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
+        require_same_user("deploy", source.plan, _user_of(manager, standing, newest(store)))
         if same := _find_same(manager, scope, source, store, standing, request):
             prune(manager, scope, store, request.keep, same.id)
             return _deployed(standing, same, 0, is_unchanged=True)
@@ -169,6 +171,15 @@ def deploy(
         finally:
             prune(manager, scope, store, request.keep, release)
     return _deployed(standing, copy.manifest, copy.copied)
+
+
+def _user_of(manager: Manager, standing: Standing, last: Manifest | None) -> str:
+    """Find as whom the dataflow of that name runs: by its unit file, its unit or a release."""
+    if standing.boot.text is not None:
+        return user_of(standing.boot.text)
+    if standing.running:
+        return str(manager.read(standing.boot.unit, ["User"])["User"])
+    return last.user if last else ""
 
 
 def _find_same(

@@ -105,6 +105,7 @@ def receive(
             threading.Thread(target=_end_with, args=(stream,), daemon=True).start()
             with _named(draft, parcel):
                 source, start = _source(scope, request, parcel, draft)
+                _require_user(scope, parcel, source)
                 sent = replace(request, start=start)
                 told = _renamed(warn, str(draft.tree), parcel.source)
                 return deploy(manager, scope, sent, tell, told, source)
@@ -196,6 +197,20 @@ def _source(
     named = tuple(parcel.files)
     sent = parcel.source or "standard input"
     return replace(source, named=named, sent=sent, revision=parcel.revision), start
+
+
+def _require_user(scope: Scope, parcel: Parcel, source: Source) -> None:
+    """Raise DoraSystemdError (NO_PERMISSION) for a project of another user that sends root.
+
+    Here that user's code would run as the user of all of root's dataflows.
+    """
+    user = source.plan.user
+    if scope.is_user or user is None or not parcel.owner or source.plan.settings.is_given(USER):
+        return
+    message = f"cannot deploy {parcel.name}: {parcel.owner} owns it where it comes from"
+    reason = f"and here it would run as {user.pw_name}, like root's dataflows"
+    hint = f"name the user here that it is to run as: --uid USER, such as --uid {user.pw_name}"
+    raise DoraSystemdError(f"{message}, {reason}", hint, ExitCode.NO_PERMISSION)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from dora_systemd.decisions.settings.table import ENV_FILE, VENV, WORKING_DIRECT
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import Place, exists, reached
+from dora_systemd.trust.paths import Place, exists, reached, user_name
 from dora_systemd.trust.programs import Account
 from dora_systemd.trust.project import opened_project
 from dora_systemd.values import format_rounded_size, shown
@@ -97,6 +97,7 @@ def packed(
             directory=os.path.relpath(directory, root) if sender.directory else None,
             revision=revision,
             files=files,
+            owner=_foreign_owner(sender),
         )
         yield Packed(parcel, spool)
 
@@ -171,6 +172,12 @@ def _reader(sender: Sender) -> Account | None:
     if os.geteuid() != 0:
         return None
     return account_of(choose_user(Scope(is_user=False, uid=0), None, sender.place, sender.root))
+
+
+def _foreign_owner(sender: Sender) -> str:
+    """The owner of the dataflow file, "" for root and the caller: both may decide over there."""
+    uid = sender.place.uid
+    return "" if uid in (0, os.geteuid()) else user_name(uid)
 
 
 def _owners(reader: Account | None) -> list[int]:

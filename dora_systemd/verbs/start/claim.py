@@ -10,13 +10,15 @@ from dora_systemd.adapters.host.unit_files import (
     remove_unit_file,
 )
 from dora_systemd.decisions.properties.assignments import Properties
-from dora_systemd.decisions.unit.file import persistent_unit, says_the_same
+from dora_systemd.decisions.settings.table import USER
+from dora_systemd.decisions.unit.file import persistent_unit, says_the_same, user_of
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.decisions.unit.versions import drop_unsupported
 from dora_systemd.decisions.views.dataflows import local_time
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
+from dora_systemd.values import shown
 from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.start.enable import (
     BootUnit,
@@ -72,6 +74,24 @@ def refuse_unit_file(boot: BootUnit) -> None:
         )
 
 
+def require_same_user(verb: str, plan: Plan, present: str) -> None:
+    """Raise DoraSystemdError (NAME_IN_USE) if a name would go from one user to another.
+
+    A user chooses the name of a directory, and so must not get that of another user's dataflow.
+    present: User= of what has the name now, or "". With --uid somebody has decided it.
+    """
+    user = "" if plan.user is None else plan.user.pw_name
+    if present in ("", user) or plan.settings.is_given(USER):
+        return
+    name, path = plan.options.name, shown(plan.options.dataflow)
+    raise DoraSystemdError(
+        f"cannot {verb} {name}: the dataflow of that name is {present}'s, and {path} would run as "
+        f"{user}",
+        f"choose another --name, or give --uid {user} to replace it",
+        ExitCode.NAME_IN_USE,
+    )
+
+
 def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
     """The plan, with the UUID of the enabled dataflow if that is from the same file."""
     known = boot.options
@@ -104,6 +124,8 @@ def place_unit_file(
         raise _differs(plan.options.name, boot)
     if not is_kept and not want_boot:
         _refuse_deployed(plan.options.name, boot)
+    if not is_kept:
+        require_same_user("start", plan, user_of(boot.text or ""))
     make_room(manager, boot)
     if links:
         _forget_links(manager, plan.options.name)

@@ -17,7 +17,7 @@ from dora_systemd.errors import DoraSystemdError
 
 A, B = Stored(1, False, "a" * 64), Stored(2, True, "b" * 64)
 FILES = {"dataflow.yml": A, "bin/run": B, "copy": A, "link": Stored(target="bin/run")}
-PARCEL = Parcel("robot", "/srv/robot", "dataflow.yml", None, "9f3c1a2+", FILES)
+PARCEL = Parcel("robot", "/srv/robot", "dataflow.yml", None, "9f3c1a2+", FILES, "ann")
 
 
 def test_what_arrives_is_what_was_sent() -> None:
@@ -44,6 +44,8 @@ def test_only_what_is_missing_is_asked_for() -> None:
         {"directory": "/etc"},
         {"revision": "; rm"},
         {"source": None},
+        {"owner": 1000},
+        {"owner": "a\nb"},
         {"source": "a\nb"},
         {"files": {"x": {"size": float("inf"), "executable": False, "sha256": "a" * 64}}},
         {"files": []},

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -248,3 +249,23 @@ def test_options_that_are_not_given_again_are_named(bench: Bench) -> None:
     bench.deploy(nice="4", env=("KEY=secret",))
     bench.deploy(nice="4")
     assert [one.partition("any more: ")[2].partition(";")[0] for one in bench.warnings] == ["--env"]
+
+
+def test_a_dataflow_of_another_user_is_not_replaced(bench: Bench) -> None:
+    """By its unit file, its unit, or its last release."""
+    first = bench.deploy()
+    path = bench.manager.paths[1]
+    text = path.read_text()
+    path.write_text(text.replace("[Service]", "[Service]\nUser=alice"))
+    lives, said = bench.manager.lives, "the dataflow of that name is alice's"
+    assert said in refused(bench).message
+    assert bench.manager.lives == lives
+    path.unlink()
+    bench.manager.units[UNIT] |= {"User": "alice"}
+    assert said in refused(bench).message
+    bench.manager.units.pop(UNIT)
+    manifest = bench.store.manifest(first.release)
+    bench.store.write_manifest(replace(manifest, user="alice"))
+    error = refused(bench)
+    assert (error.code, said in error.message) == (ExitCode.NAME_IN_USE, True)
+    assert [*bench.releases] == [first.release]

@@ -1,5 +1,6 @@
 """A name that is to be started: free, in use, enabled with the same settings or with others."""
 
+import pwd
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -195,3 +196,22 @@ def test_an_ended_transient_one_makes_room_for_its_file(manager: FakeManager, sc
     assert place(manager, make_plan(scope))
     link = ("enable", str(unit_file(manager)))
     assert manager.calls == [("reset", UNIT), ("disable", UNIT), ("reload",), link, ("reload",)]
+
+
+def user(name: str) -> pwd.struct_passwd:
+    return pwd.struct_passwd((name, "x", 1000, 1000, "", f"/home/{name}", "/bin/sh"))
+
+
+def test_the_unit_file_of_another_user_stays(manager: FakeManager, scope: Scope) -> None:
+    """A user chooses the name of a directory, from which comes that of a dataflow."""
+    place(manager, replace(make_plan(scope), user=user("alice")), want_boot=True)
+    text = unit_file(manager).read_text()
+    plan = replace(make_plan(scope, OTHER), user=user("mallory"))
+    with pytest.raises(DoraSystemdError) as caught:
+        place(manager, plan, want_boot=True)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    assert "that name is alice's, and" in caught.value.message
+    assert unit_file(manager).read_text() == text
+    settings = make_plan(scope, user="mallory").settings
+    assert place(manager, replace(plan, settings=settings), want_boot=True)
+    assert "User=mallory\n" in unit_file(manager).read_text()
