@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -21,13 +22,15 @@ from tests.system.releases import ETC, FLOW, STORE, Releases, write_version
 pytestmark = pytest.mark.lab
 
 FAST = ("--soak", "0s")
+WRITES = 'import os; open(os.environ["STATE_DIRECTORY"] + "/runs", "a").write("1")\n'
 
 
 def test_a_release_runs_and_is_not_what_it_was_copied_from(
     releases: Releases, project: Project
 ) -> None:
-    flow, cell = write_version(project, "1"), releases.cell
-    said = releases.deploy(project.root, "--soak", "1s")
+    cell, own = releases.cell, ("--property", f"StateDirectory={releases.cell.name}")
+    flow = write_version(project, "1", WRITES)
+    said = releases.deploy(project.root, "--soak", "1s", *own)
     first = releases.current()
     assert f"Release: {first}" in said
     assert releases.running() == first
@@ -45,8 +48,8 @@ def test_a_release_runs_and_is_not_what_it_was_copied_from(
     changed = cell.doractl("deploy", str(flow), "--name", cell.name, "--dry-run").stdout
     assert changed == "~ a.py\n"
     # The next one shares what has not changed, and keeps the UUID.
-    write_version(project, "2")
-    said += releases.deploy(flow, *FAST)
+    write_version(project, "2", WRITES)
+    said += releases.deploy(flow, *FAST, *own)
     assert len({line for line in said.splitlines() if line.startswith("Dataflow deployed")}) == 1
     trees = [releases.path / one / "tree/dataflow.yml" for one in releases.states()]
     assert len({tree.stat().st_ino for tree in trees}) == 1
@@ -58,6 +61,9 @@ def test_a_release_runs_and_is_not_what_it_was_copied_from(
     assert f"Release:  {first}" in cell.doractl("list", cell.name).stdout
     changed = cell.doractl("deploy", str(flow), "--name", cell.name, "--dry-run").stdout
     assert changed == "~ a.py\n", "it differs from what runs, and not from the newest one"
+    state = Path("/var/lib", cell.name)
+    assert (state / "runs").read_text() == "1111", "all of them have written to it"
+    shutil.rmtree(state)
 
 
 @pytest.mark.warns("crashed", "failed", "Failed", "exited", "exit code", "error", "Error")

@@ -57,9 +57,7 @@ def parse_manifest(text: str, path: str) -> Manifest:
         given = {str(name): _texts(one) for name, one in value.pop("given", {}).items()}
         created_us = _number(value.pop("created_us"))
         texts = {key: _text(one) for key, one in value.items()}
-        return Manifest(
-            **texts, created_us=created_us, versions=versions, files=files, given=given
-        )
+        return Manifest(**texts, created_us=created_us, versions=versions, files=files, given=given)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         message = f"cannot use {shown(path)}: it does not describe a release"
         hint = "remove that release, or deploy again"

@@ -12,12 +12,14 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
     ),
     (
         ("/.cache/uv`",),
-        f"uv cannot write its cache: --env UV_CACHE_DIR=/tmp/uv gives it one, {_MORE}",
+        "uv cannot write its cache: --property CacheDirectory=NAME --env UV_CACHE_DIR="
+        f"/var/cache/NAME gives it one, {_MORE}",
     ),
     (
         ("Read-only file system", "EROFS"),
-        "files are read-only in the sandbox: --writable PATH allows one (of a release none: have "
-        f"the node write to an absolute path outside of it), {_MORE}",
+        "files are read-only in the sandbox: --writable PATH allows one (of a release none: "
+        "--property StateDirectory=NAME gives the nodes $STATE_DIRECTORY, which stays), "
+        f"{_MORE}",
     ),
     (
         (

@@ -95,18 +95,23 @@ def change_release(
             # As an ended unit of doractl start is unloaded, systemd would remove the trial's file.
             make_room(manager, standing.boot)
         trial = make_trial(manager, scope, change.options, tell)
-        _try(manager, scope, store, standing, change, tell, trial)
+        _try(_Attempt(manager, scope, standing, change, tell), store, trial)
 
 
-def _try(
-    manager: Manager,
-    scope: Scope,
-    store: Store,
-    standing: Standing,
-    change: Change,
-    tell: Tell,
-    trial: Trial,
-) -> None:
+@dataclass(frozen=True)
+class _Attempt:
+    """A change of what stands. The fields are those of change_release()."""
+
+    manager: Manager
+    scope: Scope
+    standing: Standing
+    change: Change
+    tell: Tell
+
+
+def _try(attempt: _Attempt, store: Store, trial: Trial) -> None:
+    manager, scope, tell = attempt.manager, attempt.scope, attempt.tell
+    standing, change = attempt.standing, attempt.change
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
     mark, life = _Mark(store, change.release), read_life(manager, standing.boot.unit)
     begun = partial(_end_alone, scope, standing, change, life, mark)
@@ -126,7 +131,7 @@ def _try(
             fault = Fault(f"the command failed: {words_of(error)}", is_outside=True)
         if fault is not None:
             _ignore_signals()
-            raise _roll_back(manager, standing, change, fault, mark, tell)
+            raise _roll_back(attempt, fault, mark)
         note_run(store, standing, change.release, change.by)
         _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
@@ -176,13 +181,12 @@ class _Mark:
                 self.store.doubt(self._release)
 
 
-def _roll_back(
-    manager: Manager, standing: Standing, change: Change, fault: Fault, mark: _Mark, tell: Tell
-) -> DoraSystemdError:
+def _roll_back(attempt: _Attempt, fault: Fault, mark: _Mark) -> DoraSystemdError:
     """Go back to what was there before; the error that tells it."""
+    manager, standing, change = attempt.manager, attempt.standing, attempt.change
     mark.take_back()
     note_fault(mark.store, standing, change.release, fault, change.by)
-    name, former, tell = change.options.name, standing.current, _calm(tell)
+    name, former, tell = change.options.name, standing.current, _calm(attempt.tell)
     tell(judged(change.release, fault.reason))
     want_start = standing.was_up and not fault.is_stop
     if not fault.is_stop:
@@ -229,7 +233,8 @@ def end_killed(
         end_trial(manager, standing)
     # Once more: a restart may have been on its way.
     if read_life(manager, unit) != life:
-        _roll_back(manager, standing, change, Fault(KILLED, is_outside=True), mark, lambda _: None)
+        attempt = _Attempt(manager, scope, standing, change, lambda _: None)
+        _roll_back(attempt, Fault(KILLED, is_outside=True), mark)
 
 
 def _note_stop(manager: Manager, change: Change) -> None:

@@ -274,4 +274,3 @@ def _at_source(
     if source.dora and "dora build" in hint:
         hint = "the build has to make it there"
     return DoraSystemdError(message, hint, error.code)
-

@@ -3,8 +3,9 @@
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from dora_systemd.adapters.bus.manager import Beside, Observer, Property
+from dora_systemd.adapters.bus.manager import Property
 from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.releases.progress import Step
 from dora_systemd.decisions.unit.file import runner_of
@@ -39,18 +40,13 @@ class Systemd(CheckingManager):
         self.paths = [trial_path(scope, UNIT), self.etc / "systemd/user" / UNIT]
 
     def start_transient(
-        self,
-        unit: str,
-        properties: Sequence[Property],
-        observer: Observer | None,
-        wait: bool,
-        beside: Beside = (),
+        self, unit: str, properties: Sequence[Property], *how: Any, **more: Any
     ) -> str:
         (command,) = next(value for name, _, value in properties if name == "ExecStart")
         template = self.said
         self.said = template.replace(b"TREE", os.fsencode(Path(command[1][-1]).parent))
         try:
-            return super().start_transient(unit, properties, observer, wait, beside)
+            return super().start_transient(unit, properties, *how, **more)
         finally:
             self.said = template
 

@@ -383,7 +383,7 @@ def test_absolute_paths(tmp_path: Path) -> None:
         ("OSError: [Errno 30] Read-only file system: '/srv/x'", "--writable PATH"),
         (
             'Os { code: 30, kind: ReadOnlyFilesystem, message: "Read-only file system" }',
-            "--writable",
+            "--property StateDirectory=NAME",
         ),
         ("FileNotFoundError: [Errno 2] No such file or directory: '/dev/video0'", "--device"),
         ("FileNotFoundError: [Errno 2] No such file or directory: '/tmp/map'", "--writable /tmp"),
@@ -395,7 +395,7 @@ def test_absolute_paths(tmp_path: Path) -> None:
         ("OSError: [Errno 28] No space left on device", "that the node writes to"),
         ("OSError: [Errno 28] No space left on device: '/a/{b}'", "df '/a/{b}'"),
         ("", ""),
-        ("error: Failed to initialize cache at `/.cache/uv`", "--env UV_CACHE_DIR=/tmp/uv"),
+        ("error: Failed to initialize cache at `/.cache/uv`", "--property CacheDirectory=NAME"),
         ("[ WARN:0] VIDEOIO(V4L2:/dev/video0): can't open camera by index", "--device PATH"),
     ],
 )
