@@ -168,7 +168,7 @@ def test_where_a_release_is_built() -> None:
 
 def test_all_variables_of_a_build() -> None:
     always = {
-        **{"SOURCE_DATE_EPOCH": "315532800", "UV_COMPILE_BYTECODE": "1", "UV_NO_CACHE": "1"},
+        **{"SOURCE_DATE_EPOCH": "315532800", "UV_COMPILE_BYTECODE": "0", "UV_NO_CACHE": "1"},
         **{"UV_LINK_MODE": "copy", "UV_PYTHON_DOWNLOADS": "never"},
         **{"UV_PYTHON_PREFERENCE": "only-system", "PIP_NO_INPUT": "1", "GIT_TERMINAL_PROMPT": "0"},
     }
