@@ -56,13 +56,22 @@ TEXT = f"""{{
    "built": true
   }}
  }},
+ "given": {{
+  "nice": "3",
+  "needs": [
+   "a:/dev/cam"
+  ]
+ }},
  "schema": 1
 }}
 """
 
 
+GIVEN: dict[str, str | list[str]] = {"nice": "3", "needs": ["a:/dev/cam"]}
+
+
 def test_the_text_of_a_manifest() -> None:
-    one = Manifest(ID, "robot", "u", "d.yml", "/srv", "eve", "", 7, {"dora": "1"}, FILES)
+    one = Manifest(ID, "robot", "u", "d.yml", "/srv", "eve", "", 7, {"dora": "1"}, FILES, GIVEN)
     assert format_manifest(one) == TEXT
     found = parse_manifest(TEXT, "x")
     assert found == one
@@ -77,7 +86,15 @@ def test_a_manifest_without_versions() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"schema": 2}, {"files": {"a": {}}}, {"more": "x"}, {"id": 1}, {"created_us": True}]
+    "change",
+    [
+        {"schema": 2},
+        {"files": {"a": {}}},
+        {"more": "x"},
+        {"id": 1},
+        {"created_us": True},
+        {"given": {"nice": 3}},
+    ],
 )
 def test_what_is_no_manifest(change: dict[str, Any]) -> None:
     with pytest.raises(DoraSystemdError) as caught:
@@ -88,13 +105,13 @@ def test_what_is_no_manifest(change: dict[str, Any]) -> None:
     assert error.code is ExitCode.BAD_INPUT
 
 
-PARCEL = Parcel("robot", "/srv", "d.yml", ".", "", {"d.yml": Stored(3, False, DIGEST)})
+PARCEL = Parcel("robot", "/srv", "d.yml", ".", "", {"d.yml": Stored(3, False, DIGEST)}, "eve")
 
 
 def test_the_first_line_of_a_parcel() -> None:
     head = '{"schema": 1, "name": "robot", "source": "/srv", "dataflow": "d.yml", "directory": "."'
     file = f'{{"size": 3, "executable": false, "sha256": "{DIGEST}"}}'
-    line = f'{head}, "revision": "", "files": {{"d.yml": {file}}}}}\n'
+    line = f'{head}, "revision": "", "files": {{"d.yml": {file}}}, "owner": "eve"}}\n'
     assert format_parcel(PARCEL) == line.encode()
     assert parse_parcel(line.encode()) == PARCEL
     assert format_wants(iter((0, 2))) == '{"wants": [0, 2]}'
