@@ -11,7 +11,7 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.reason import job_reason, need_failure, runners_refusal
+from dora_systemd.verbs.facts.reason import job_reason, logs_hint, need_failure, runners_refusal
 from dora_systemd.verbs.node import socket_of
 from dora_systemd.verbs.stop import THAWED, note_stop
 
@@ -86,9 +86,10 @@ def _outcome(manager: Manager, scope: Scope, cell: Cell, result: str, was_frozen
     if result == "dependency":
         needed = manager.read(cell.unit, ["Requires"])["Requires"] or ()
         reason, more = need_failure(manager, scope.flag, needed)
+        hint = f"{more} tells more"
     elif refusal := runners_refusal(manager, cell.unit):
         return Outcome.of_error(cell, refusal)
     else:
         reason = job_reason(manager, cell.unit, result)
-        more = f"doractl {scope.flag} why {cell.name}"
-    return Outcome(cell, "", f"cannot restart {cell.name}: {reason}", hint=f"{more} tells more")
+        hint = logs_hint(scope.flag, cell.name, reason)
+    return Outcome(cell, "", f"cannot restart {cell.name}: {reason}", hint=hint)

@@ -215,7 +215,9 @@ def test_a_failed_start_says_why(cell: Cell, project: Project) -> None:
     *words, message, hint = done.stderr.splitlines()
     assert "  one: ModuleNotFoundError: No module named 'nosuchmodule'" in words
     assert message == f"doractl: cannot start {cell.name}: node one: exit code 1"
-    assert hint == f"hint: doractl {cell.scope.flag} why {cell.name} tells more"
+    flag = cell.scope.flag
+    check = f"check logs: doractl {flag} logs {cell.name} --node one"
+    assert hint == f"hint: {check}; doractl {flag} why {cell.name} tells more"
 
 
 # As above.

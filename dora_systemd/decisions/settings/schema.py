@@ -40,8 +40,9 @@ def validation_error(
     settings = {setting.name: setting for setting in table}
     if first["type"] == "extra_forbidden":
         near = did_you_mean(place[-1], _known(place, table))
-        hint = near or "doractl start --help lists the settings"
-        reason = f"unknown key {quoted(place[-1])}"
+        hint = near or "dora-systemd.yml(5) lists the keys"
+        owner = f" of node {quoted(place[1])}" if len(place) > 2 and place[0] == "nodes" else ""
+        reason = f"unknown key {quoted(place[-1])}{owner}"
     else:
         key = next((part for part in reversed(place) if part in settings), place[0])
         expected = settings[key].kind.expected if key in settings else "a mapping"

@@ -25,7 +25,7 @@ from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_rows
 from dora_systemd.verbs.facts.list import read_rows
 from dora_systemd.verbs.facts.nodes import written_dataflow
-from dora_systemd.verbs.facts.reason import failure_reason
+from dora_systemd.verbs.facts.reason import failure_reason, logs_hint
 from dora_systemd.verbs.follow import is_unit_up
 from dora_systemd.verbs.why import explain, words_of_start
 
@@ -122,8 +122,9 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
     if state["ActiveState"] != "failed":
         return _over(scope, uuid)
     lines = "".join(f"\n  {line}" for line in words_of_start(bus, scope, uuid))
-    hint = f"doractl {scope.flag} why {cell.name} tells more"
-    error = f"cannot start {cell.name}: {failure_reason(bus, cell.unit)}\n\n  hint: {hint}"
+    reason = failure_reason(bus, cell.unit)
+    hint = logs_hint(scope.flag, cell.name, reason)
+    error = f"cannot start {cell.name}: {reason}\n\n  hint: {hint}"
     return {"Error": error + (f"\n{lines}" if lines else "")}
 
 

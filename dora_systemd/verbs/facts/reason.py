@@ -1,5 +1,6 @@
 """Explains why a unit did not start or has failed, from its properties."""
 
+import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -13,6 +14,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import name_from_unit
 
 _PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
+_NODE = re.compile(r"node (\S+): ")
 _CLD_EXITED = 1
 """ExecMainCode of a process that exited, see waitid(2)."""
 
@@ -24,6 +26,18 @@ def job_reason(manager: Manager, unit: str, result: str) -> str:
     if result == "dependency":
         return "a unit that it needs failed"
     return failure_reason(manager, unit)
+
+
+def logs_hint(flag: str, name: str, reason: str) -> str:
+    """Where more is found about a dataflow that failed to start, in the words that dora uses.
+
+    flag: of the scope. reason: of job_reason().
+    """
+    more = f"doractl {flag} why {name} tells more"
+    found = _NODE.match(reason)
+    if not found:
+        return more
+    return f"check logs: doractl {flag} logs {name} --node {found[1]}; {more}"
 
 
 def need_failure(manager: Manager, flag: str, needed: Iterable[str]) -> tuple[str, str]:

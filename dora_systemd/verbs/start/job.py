@@ -27,7 +27,7 @@ from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.reason import job_reason, need_failure, runners_refusal
+from dora_systemd.verbs.facts.reason import job_reason, logs_hint, need_failure, runners_refusal
 from dora_systemd.verbs.start.unit import systemd_number
 
 _POLL_SECONDS = 0.2
@@ -168,5 +168,5 @@ def _start_failure(
     manager: Manager, scope: Scope, unit: str, name: str, result: str
 ) -> DoraSystemdError:
     reason = job_reason(manager, unit, result)
-    hint = f"doractl {scope.flag} why {name} tells more"
+    hint = logs_hint(scope.flag, name, reason)
     return DoraSystemdError(f"cannot start {name}: {reason}", hint, ExitCode.FAILURE)

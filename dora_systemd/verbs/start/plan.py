@@ -29,9 +29,10 @@ from dora_systemd.decisions.settings.table import ENV, ENV_FILE, USER, WORKING_D
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_path, parse_name, release_of, unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.trust.files import read_file
-from dora_systemd.trust.paths import Place
+from dora_systemd.trust.files import Text, read_file
+from dora_systemd.trust.paths import Place, exists
 from dora_systemd.trust.sight import sight_of
+from dora_systemd.values import shown
 from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.credentials import check_credentials, credential_files
 from dora_systemd.verbs.start.notes import plan_notes
@@ -107,7 +108,24 @@ def path_of(request: StartRequest) -> Path:
     """The absolute path that was asked for. Raises DoraSystemdError (BAD_INPUT) if it is empty."""
     if not request.dataflow:  # not the working directory: a variable of a script is not set
         raise DoraSystemdError("cannot read '': no path", "name a file", ExitCode.BAD_INPUT)
-    return Path(request.dataflow).absolute()
+    try:
+        return Path(request.dataflow).absolute()
+    except FileNotFoundError as error:
+        message = f"cannot read {shown(request.dataflow)}: the current directory was removed"
+        hint = "cd to a directory that exists"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT) from error
+
+
+def _read(path: Path) -> Text:
+    """The dataflow file. Raises DoraSystemdError (BAD_INPUT)."""
+    try:
+        return read_file(path)
+    except DoraSystemdError as error:
+        if path.name != DEFAULT_FILE or exists(path):
+            raise
+        # Perhaps nobody has named it.
+        hint = "go to the directory of a dataflow, or name its file"
+        raise DoraSystemdError(error.message, hint, error.code) from error
 
 
 def make_plan(scope: Scope, request: StartRequest) -> Plan:
@@ -117,7 +135,7 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
     """
     path = path_of(request)
     request_name(request)
-    written = read_file(path)
+    written = _read(path)
     if request.origin is None:
         _refuse_release(path)
     place = request.origin or written.place

@@ -92,7 +92,9 @@ def test_a_restart_that_fails_is_told_with_where_to_look(bench: Bench) -> None:
     bench.manager.units[UNIT] |= {"StatusText": "failed: node a: exit code 3"}
     with pytest.raises(DoraSystemdError, match="node a: exit code 3") as caught:
         bench.act("restart")
-    assert caught.value.hint == f"doractl {bench.scope.flag} why robot tells more"
+    flag = bench.scope.flag
+    check = f"check logs: doractl {flag} logs robot --node a"
+    assert caught.value.hint == f"{check}; doractl {flag} why robot tells more"
 
 
 def test_the_page_names_a_dataflow_that_is_gone(bench: Bench) -> None:

@@ -53,6 +53,16 @@ def test_restart_that_fails(manager: FakeManager) -> None:
     assert outcome.hint == "doractl --user why robot tells more"
 
 
+def test_the_node_that_failed_has_its_logs_named(manager: FakeManager) -> None:
+    reason = "node camera: exit code 1, node plot: exit code 1 because node camera failed"
+    manager.units[UNIT] |= {"StatusText": f"failed: {reason}", "ExecMainStatus": 1}
+    manager.job_results[UNIT] = "failed"
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
+    assert outcome.problem == f"cannot restart robot: {reason}"
+    more = "doractl --user why robot tells more"
+    assert outcome.hint == f"check logs: doractl --user logs robot --node camera; {more}"
+
+
 def test_restart_that_the_runner_refuses(manager: FakeManager) -> None:
     """As a start: the hint is no part of the sentence."""
     said = format_refusal(REFUSAL)

@@ -156,7 +156,7 @@ def test_a_numeric_user_is_a_text() -> None:
         ("text", "it is not a mapping", "mapping"),
         ({"grace_duratoin": 1}, "unknown key 'grace_duratoin'", "did you mean grace_duration?"),
         ({"grace-duration": 1}, "unknown key 'grace-duration'", "did you mean grace_duration?"),
-        ({"zzzzzz": 1}, "unknown key 'zzzzzz'", "--help"),
+        ({"zzzzzz": 1}, "unknown key 'zzzzzz'", "dora-systemd.yml(5)"),
         ({1: 2}, "a key in it is int, not text", "quotes"),
         ({"uv": [1]}, "the value of uv is of another type", "yes or no"),
         ({"uv": 1}, "the value of uv is of another type", "yes or no"),
@@ -291,8 +291,8 @@ def test_a_new_setting_is_one_declaration() -> None:
 @pytest.mark.parametrize(
     ("document", "message"),
     [
-        ({"nodes": {"camera": {"uv": True}}}, "unknown key 'uv'"),
-        ({"nodes": {"camera": {"mod": 1}}}, "unknown key 'mod'"),
+        ({"nodes": {"camera": {"uv": True}}}, "unknown key 'uv' of node 'camera'"),
+        ({"nodes": {"camera": {"mod": 1}}}, "unknown key 'mod' of node 'camera'"),
         ({"nodes": {"camera": 5}}, "the value of nodes is of another type"),
         ({"nodes": []}, "the value of nodes is of another type"),
     ],

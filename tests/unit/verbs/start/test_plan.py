@@ -57,6 +57,27 @@ def test_a_plain_plan(project: Path) -> None:
     assert plan.environment["PATH"].startswith(f"{project}/bin:")
 
 
+@pytest.mark.parametrize("path", ["dataflow.yml", "./dataflow.yml"])
+def test_no_dataflow_here(project: Path, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(project)
+    with pytest.raises(DoraSystemdError, match=f"{project}/dataflow.yml: there is no") as caught:
+        make_plan(USER, StartRequest(path))
+    assert caught.value.hint == "go to the directory of a dataflow, or name its file"
+    with pytest.raises(DoraSystemdError, match="there is no such file") as caught:
+        make_plan(USER, StartRequest("robt.yml"))
+    assert caught.value.hint == "correct the path"
+
+
+def test_no_directory_here(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = project / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(DoraSystemdError, match="the current directory was removed") as one:
+        make_plan(USER, StartRequest("dataflow.yml"))
+    assert one.value.code is ExitCode.BAD_INPUT
+
+
 def test_every_plan_has_a_uuid_of_its_own(project: Path) -> None:
     assert plan_of(project).options.uuid != plan_of(project).options.uuid
 
