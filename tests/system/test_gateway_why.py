@@ -79,6 +79,7 @@ def test_one_that_failed(scheme: str, browser: Browser, cell: Cell, project: Pro
     # No graph of nothing.
     assert not browser.js("document.querySelector('#detail .charts .chart').checkVisibility()")
     browser.wait_text("#totals", "1 failed")
+    assert "1 dataflow" in browser.text("#totals"), "it has a card"
     look(browser, "failed", scheme)
     assert browser.failures() == []
 
@@ -91,6 +92,7 @@ def test_one_that_is_degraded(scheme: str, browser: Browser, cell: Cell, project
     browser.wait_text("#detail .why h2", "Why it is degraded")
     browser.wait_text("#detail .why .summary", f"node {LONG}: exit code 1")
     browser.wait_text("#detail .why .words", "<b>bold</b>")
+    browser.wait_text("#list .card .facts", f"node {LONG}: exit code 1")
     assert browser.js("document.querySelectorAll('#detail .why .words b').length") == 0
     browser.wait_text(f"{node(LONG)} .badge", "Failed")
     browser.wait_text(f"{node('sink')} .badge", "Running")

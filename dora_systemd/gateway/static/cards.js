@@ -20,7 +20,9 @@ export class Card {
     say(this.name, flow.name);
     showState(this.badge, flow.status);
     const ended = flow.ended_us ? since(flow.ended_us) : "";
-    const parts = [flow.status === "Waiting" || !isUp(flow) ? flow.text : `up ${uptime(flow.uptime_us)}`,
+    const hasRun = isUp(flow) && flow.status !== "Waiting";
+    const needsHand = !hasRun || flow.status === "Degraded";
+    const parts = [hasRun ? `up ${uptime(flow.uptime_us)}` : "", needsHand ? flow.text : "",
       flow.nodes_total ? `${flow.nodes_alive}/${flow.nodes_total} nodes` : "",
       flow.restarts ? plural(flow.restarts, "restart") : "", ended,
       flow.release ? `release ${flow.release}` : ""];
@@ -40,6 +42,6 @@ export function totals(flows, history) {
   const count = (status) => flows.filter((flow) => flow.status === status).length;
   const bad = ["Failed", "Degraded"].filter(count)
     .map((status) => `${count(status)} ${status.toLowerCase()}`);
-  return [...bad, plural(up.length, "dataflow"), plural(nodes, "node"), `CPU ${percent(cpu)}`,
+  return [...bad, plural(flows.length, "dataflow"), plural(nodes, "node"), `CPU ${percent(cpu)}`,
     bytes(memory)];
 }

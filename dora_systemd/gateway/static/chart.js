@@ -36,7 +36,7 @@ export class Chart {
       el("span", { class: "amount" }, this.value, this.of),
       this.picture,
       el("span", { class: "axis muted", "aria-hidden": "true" },
-        this.top, this.begin, el("span", {}, "0, now")),
+        this.top, this.begin, el("span", {}, "now")),
     );
   }
 
@@ -46,7 +46,8 @@ export class Chart {
     const most = Math.max(least, ...values);
     // A limit far above what is used would leave a flat line: it is not drawn then.
     const isNear = limit != null && limit < 4 * most;
-    const top = 1.1 * (isNear ? Math.max(most, limit) : most);
+    // The room of the label, which neither line crosses.
+    const top = 1.3 * (isNear ? Math.max(most, limit) : most);
     // From a minute on, as long as what is known.
     this.wide = Math.max(values.length, LEAST_SPAN) - 1;
     this.picture.setAttribute("viewBox", `0 0 ${this.wide} ${HEIGHT}`);
@@ -58,7 +59,7 @@ export class Chart {
       "d", isLine ? `M${this.#x(0)} ${HEIGHT}L${points}L${this.wide} ${HEIGHT}Z` : "");
     this.limit.setAttribute("d", isNear ? `M0 ${y(limit)}H${this.wide}` : "");
     say(this.top, this.format(top));
-    say(this.begin, isLine ? `since ${span(times.at(-1) - times[0])}` : "");
+    say(this.begin, isLine ? `${span(times.at(-1) - times[0])} ago` : "");
     this.#label(values.length ? Math.max(...values) : null);
     this.#read();
   }

@@ -2,7 +2,7 @@
 
 import { el } from "./dom.js";
 import { Facts, showState } from "./parts.js";
-import { bytes, clock, plural, since, span, tone } from "./words.js";
+import { bytes, clock, since, span, tone } from "./words.js";
 
 const TITLES = {
   Failed: "Why it failed", Degraded: "Why it is degraded", Restarting: "Why it restarts",
@@ -82,7 +82,7 @@ export class Why {
       el("p", { class: "summary" }, badge, " ", el("strong", {}, why.summary)),
       this.#facts(why),
       list("What to do", "remedies", why.remedies.map(remedy)),
-      list(`The last ${plural(last.length, "line")} of ${why.node || "its nodes"}`, "words", last),
+      list(`The last ${last.length === 1 ? "line" : `${last.length} lines`} of ${why.node || "its nodes"}`, "words", last),
       why.node ? el("p", {}, el("button", { type: "button", class: "small",
         onclick: () => this.choose(why.node) }, `All logs of ${why.node}`)) : null,
       list("What happened", "timeline", news),
