@@ -92,7 +92,7 @@ def test_one_that_is_degraded(scheme: str, browser: Browser, cell: Cell, project
     browser.wait_text("#detail .why h2", "Why it is degraded")
     browser.wait_text("#detail .why .summary", f"node {LONG}: exit code 1")
     browser.wait_text("#detail .why .words", "<b>bold</b>")
-    browser.wait_text("#list .card .facts", f"node {LONG}: exit code 1")
+    browser.wait_text("#list .card .facts", f"failed: {LONG} (exit code 1)")
     assert browser.js("document.querySelectorAll('#detail .why .words b').length") == 0
     browser.wait_text(f"{node(LONG)} .badge", "Failed")
     browser.wait_text(f"{node('sink')} .badge", "Running")

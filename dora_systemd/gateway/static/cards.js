@@ -21,9 +21,11 @@ export class Card {
     showState(this.badge, flow.status);
     const ended = flow.ended_us ? since(flow.ended_us) : "";
     const hasRun = isUp(flow) && flow.status !== "Waiting";
-    const needsHand = !hasRun || flow.status === "Degraded";
-    const parts = [hasRun ? `up ${uptime(flow.uptime_us)}` : "", needsHand ? flow.text : "",
-      flow.nodes_total ? `${flow.nodes_alive}/${flow.nodes_total} nodes` : "",
+    // The text of a degraded one has the number of its nodes.
+    const isDegraded = flow.status === "Degraded";
+    const parts = [hasRun ? `up ${uptime(flow.uptime_us)}` : "",
+      hasRun && !isDegraded ? "" : flow.text,
+      flow.nodes_total && !isDegraded ? `${flow.nodes_alive}/${flow.nodes_total} nodes` : "",
       flow.restarts ? plural(flow.restarts, "restart") : "", ended,
       flow.release ? `release ${flow.release}` : ""];
     say(this.facts, parts.filter(Boolean).join(" · "));
