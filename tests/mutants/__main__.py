@@ -106,14 +106,17 @@ def run(tree: Path, seed: int, sample: int) -> int:
 
 
 def add_tests(file: Path, mutants: Sequence[Mutant]) -> None:
-    """Give functions that only child processes call, where mutmut sees no call, their tests."""
+    """Give each function the tests of its module, too.
+
+    mutmut sees no call in a child process, and none while pytest collects the tests.
+    """
     stats = json.loads(file.read_text())
     known, durations = stats["tests_by_mangled_function_name"], stats["duration_by_test"]
     for mutant in mutants:
         function = re.sub(r"__mutmut_\d+$", "", mutant.name)
-        if not known.get(function):
-            tests = f"tests/unit/{mutant.folder}/test_{mutant.path.name}::"
-            known[function] = [test for test in durations if test.startswith(tests)]
+        tests = f"tests/unit/{mutant.folder}/test_{mutant.path.name}::"
+        own = (test for test in durations if test.startswith(tests))
+        known[function] = list(dict.fromkeys([*known.get(function, []), *own]))
     file.write_text(json.dumps(stats))
 
 

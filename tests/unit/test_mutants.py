@@ -83,7 +83,7 @@ def test_where_a_function_is(name: str, line: int) -> None:
     assert find_line(SOURCE, name) == line
 
 
-def test_a_function_that_only_a_child_calls_has_tests(tmp_path: Path) -> None:
+def test_a_function_has_the_tests_of_its_module(tmp_path: Path) -> None:
     file = tmp_path / "stats.json"
     tests = ["tests/unit/trust/test_gate.py::test_a", "tests/unit/trust/test_other.py::test_b"]
     called = {"dora_systemd.trust.gate.x_called": tests[1:]}
@@ -92,7 +92,9 @@ def test_a_function_that_only_a_child_calls_has_tests(tmp_path: Path) -> None:
     names = [NAME, "dora_systemd.trust.gate.x_called__mutmut_1"]
     add_tests(file, [Mutant(name, PATH, "") for name in names])
     found = json.loads(file.read_text())["tests_by_mangled_function_name"]
-    assert found == {**called, NAME.removesuffix("__mutmut_12"): tests[:1]}
+    gate, other = tests
+    function = NAME.removesuffix("__mutmut_12")
+    assert found == {"dora_systemd.trust.gate.x_called": [other, gate], function: [gate]}
 
 
 def test_the_folders_and_their_tests_are_there() -> None:
