@@ -51,11 +51,11 @@ def plan_test(form: str) -> list[Step]:
     (unit,) = plan_unit(form)
     build, inside, several = build_step(), limits_step(), machines_step()
     queue = [replace(one, after=(unit.name,)) for one in plan_system("container")]
-    inside = replace(inside, after=(unit.name,))
+    inside, several = (replace(one, after=(unit.name,)) for one in (inside, several))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
-    # One lane beside the machine and the queue: two cores have no time for more.
-    lane = [build, packages_step(), several, *plan_lab(form), *plan_other_python(form)]
-    return [unit, *in_a_row(lane, unit), inside, restarted, *queue]
+    lane = [build, packages_step(), *plan_lab(form), *plan_other_python(form)]
+    # The machines have the longest way, nearly all of it waiting, so nothing is before them.
+    return [unit, several, *in_a_row(lane, unit), inside, restarted, *queue]
 
 
 def in_a_row(steps: Sequence[Step], first: Step) -> list[Step]:
