@@ -42,7 +42,7 @@ from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.check import beside_properties, exec_start
 
-_LIBEXEC = str(Path(__file__).parents[2] / "libexec/build")
+_LIBEXEC = str(Path(__file__).parents[2] / "libexec/builds")
 _LOOK_SECONDS = 0.2
 _GONE_SECONDS = 20.0
 _LATE_SECONDS = 30.0
