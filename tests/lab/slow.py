@@ -16,7 +16,7 @@ from lab.errors import LabError
 PERIOD_SECONDS = 0.02
 FULL_SPEED = 100
 # One process does what a hundred do in a container, and each session there has a share of its own.
-GROUP_NICE = -10
+GROUP_NICE = -3
 
 
 def read_speed(text: str | None) -> int:

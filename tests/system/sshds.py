@@ -105,7 +105,8 @@ def shell_of(user: str, shell: str, files: Mapping[str, str]) -> Iterator[None]:
     kept = {name: (home / name).read_text() for name in files if (home / name).exists()}
     run("usermod", "--shell", shell, user)
     for name, text in files.items():
-        (home / name).parent.mkdir(parents=True, exist_ok=True)
+        # As that user: later tests write there as well.
+        run("runuser", "-u", user, "--", "mkdir", "-p", str((home / name).parent))
         (home / name).write_text(text)
     try:
         yield
