@@ -39,8 +39,8 @@ def run_apart(command: Sequence[str], environment: Mapping[str, str], account: A
     os.close(theirs)
     screen = next((fd for fd in (1, 2, 0) if os.isatty(fd)), None)
     try:
-        with _carried(child, ours, screen):
-            _carry(child, ours, screen)
+        with _woken() as wake, _carried(child, ours, screen):
+            _carry(child, ours, screen, wake)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     finally:
         os.close(ours)
@@ -62,6 +62,22 @@ def _become_program(
         print(f"doractl: cannot run {command[0]}: {error.strerror}", file=sys.stderr, flush=True)
     finally:
         os._exit(ExitCode.NO_DORA)
+
+
+@contextlib.contextmanager
+def _woken() -> Iterator[int]:
+    """A descriptor that is readable after each signal.
+
+    Python handles a signal that comes just before select(2) only after that has returned.
+    """
+    wake, waker = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+    before = signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
+    try:
+        yield wake
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(wake)
+        os.close(waker)
 
 
 @contextlib.contextmanager
@@ -96,12 +112,14 @@ def _copy_size(screen: int | None, ours: int) -> None:
             fcntl.ioctl(ours, termios.TIOCSWINSZ, fcntl.ioctl(screen, termios.TIOCGWINSZ, bytes(8)))
 
 
-def _carry(child: int, ours: int, screen: int | None) -> None:
+def _carry(child: int, ours: int, screen: int | None, wake: int) -> None:
     """Copy input and output until the program has ended."""
     end = os.pidfd_open(child)
-    sources = [end, ours, *([0] if os.isatty(0) else [])]
+    sources = [end, ours, wake, *([0] if os.isatty(0) else [])]
     try:
         while end not in (ready := select.select(sources, [], [])[0]):
+            if wake in ready:
+                os.read(wake, _CHUNK)
             if ours in ready and not _copy(ours, screen):
                 sources.remove(ours)
             if 0 in ready and not _copy(0, ours):
