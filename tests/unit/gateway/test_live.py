@@ -54,7 +54,7 @@ class Browser:
         self.inbox.put_nowait(None)
 
     async def wait_for(self, kind: str, count: int = 1) -> list[dict[str, Any]]:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while len(found := [one for one in self.got if one["type"] == kind]) < count:
                 await asyncio.sleep(0.005)
         return found
@@ -71,7 +71,7 @@ def play(story: Story, **means: Any) -> Browser:
         talking = asyncio.ensure_future(talk(browser, REQUEST, Means(0.01, **means)))
         await story(browser)
         browser.leave()
-        await within(10, talking)
+        await within(60, talking)
         assert len(asyncio.all_tasks()) == 1
         return browser
 
@@ -223,7 +223,7 @@ def test_a_page_that_takes_nothing_is_given_up() -> None:
     async def both() -> None:
         browser = Browser()
         browser.is_stuck = True
-        await within(10, talk(browser, REQUEST, Means(send_seconds=0.05)))
+        await within(60, talk(browser, REQUEST, Means(send_seconds=0.05)))
 
     asyncio.run(both())
 
