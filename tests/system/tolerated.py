@@ -28,6 +28,7 @@ _SLOW = "a node or the daemon got no processor for a while"
 _ENDING = "one end of a connection within the cell was closed a moment before the other"
 
 TOLERATED = (
+    Word("timeout while waiting for event stream thread", _SLOW),  # of a node that ends
     Word("Scouting delay elapsed before start conditions are met", _ORDER),
     Word("Unable to find transport for link event", _ORDER),
     Word("Error syncing transport with peer", _ORDER),
@@ -37,6 +38,7 @@ TOLERATED = (
     Word("Unknown subscriber", _ORDER),
     Word("Unknown interest", _ORDER),
     Word("Unknown token", _ORDER, is_all=True),
+    Word("Unknown wire expr", _ORDER, is_all=True),
     Word("Unknown id", _ORDER, is_all=True),  # of a queryable
     Word("[Gossip] Received LinkStateList from unknown link", _ORDER),
     Word("Attempt to establish transport to itself", _ORDER),
