@@ -90,7 +90,7 @@ def test_a_way_back(manager: FakeManager, scope: Scope, store: Store, notes: Not
 def test_a_trial_that_somebody_stops(
     manager: FakeManager, scope: Scope, store: Store, notes: Notes
 ) -> None:
-    """Who has stopped it has been noted by the command that did."""
+    """The command that stopped the dataflow has recorded who did it."""
     deployed(manager)
     fault = Fault("it was stopped", is_stop=True)
     error = refusal(lambda: try_new(manager, scope, store, fault))
