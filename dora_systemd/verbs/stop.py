@@ -17,6 +17,7 @@ from dora_systemd.values import INFINITY, SECOND, format_duration
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units, own_directories, trial_path
 from dora_systemd.verbs.facts.reason import failure_reason
+from dora_systemd.verbs.facts.restarts import read_restarts
 from dora_systemd.verbs.start.asked import note_request
 
 UNBOUNDED_SECONDS = 90.0
@@ -242,7 +243,7 @@ def _not_running(cell: Cell) -> Outcome:
 
 
 def _reset(manager: Manager, cell: Cell) -> Outcome:
-    used = manager.read(cell.unit, ["NRestarts"])["NRestarts"]
+    used = read_restarts(manager, cell)
     manager.reset_failed(cell.unit)
     return Outcome(
         cell, f"Dataflow reset: {cell.uuid} ({cell.name}, restart counter reset, was {used})"

@@ -17,7 +17,7 @@ from tests.system.cells import run
 SAMPLE_SECONDS = 0.1
 PROPERTIES = (
     *("ActiveState", "SubState", "NRestarts", "InvocationID", "MainPID", "ControlGroup", "Result"),
-    *("LoadState", "Job", "StatusText"),
+    *("LoadState", "Job", "StatusText", "ExecMainStatus"),
 )
 RESTART_SCHEDULED = "5eb03494b6584870a536b337290809b3"
 """SD_MESSAGE_UNIT_RESTART_SCHEDULED, see sd-messages.h."""

@@ -102,6 +102,7 @@ def test_starts_by_hand_use_up_no_restart(cell: Cell, project: Project) -> None:
     kill(cell, "runner")
     wait_for("it is given up", lambda: cell.show("ActiveState") == "failed")
     assert cell.show("ExecMainStatus") == "75"
+    assert (cell.show("NRestarts"), listed(cell)["restarts"]) == ("2", 1), "one was refused"
     words = cell.doractl("why", cell.name, check=False).stdout
     assert "Why:      the supervisor process was killed (SIGKILL)" in words
     assert "Restarts: dataflow 1 (the supervisor process was killed (SIGKILL))" in words

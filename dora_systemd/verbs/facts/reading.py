@@ -19,6 +19,7 @@ from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_table, read_times
 from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.restarts import read_restarts, without_refused
 
 if TYPE_CHECKING:  # the table of `list` does without
     from dora_systemd.decisions.cell.owed import Owed
@@ -35,11 +36,11 @@ _ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, _TEXT, _READY_AT)
 class Reading(NamedTuple):
     """One reading of a dataflow: its state from systemd and its runner, and usage of its groups.
 
-    unit: properties of its unit. problem: why its node table is not usable, or "". groups, usage:
-    by node, with the unit's own as WHOLE_CELL; empty for a dataflow that is not running. at_us:
-    time of the reading, CLOCK_MONOTONIC. heard: the last message of each owed output, on the same
-    clock, 0 is never. held: what systemd waits for before it starts it. is_frozen: whether
-    somebody has frozen the unit.
+    unit: properties of its unit; NRestarts without a restart that was refused. problem: why its
+    node table is not usable, or "". groups, usage: by node, with the unit's own as WHOLE_CELL;
+    empty for a dataflow that is not running. at_us: time of the reading, CLOCK_MONOTONIC. heard:
+    the last message of each owed output, on the same clock, 0 is never. held: what systemd waits
+    for before it starts it. is_frozen: whether somebody has frozen the unit.
     """
 
     cell: Cell
@@ -99,6 +100,7 @@ def read_dataflow(
         unit = known | manager.read(cell.unit, _missing(cell, status, path, known, is_row))
     else:
         unit = manager.read(cell.unit, _ALL if cell.is_up else (*_ALL, ENDED))
+    unit |= {"NRestarts": without_refused(manager, cell, unit["NRestarts"])}
     if not cell.is_up or not (path or unit["ControlGroup"]):
         return Reading(cell, unit, status, problem)
     path = path or cgroup.group_path(unit["ControlGroup"])
@@ -116,7 +118,7 @@ def _read_held(manager: Manager, cell: Cell) -> Reading:
     # Imported late: few dataflows need anything, and those that run have it.
     from dora_systemd.verbs.facts.held import read_held
 
-    unit = manager.read(cell.unit, ["NRestarts"])
+    unit = {"NRestarts": read_restarts(manager, cell)}
     return Reading(cell, unit, at_us=_monotonic_us(), held=read_held(manager, cell))
 
 

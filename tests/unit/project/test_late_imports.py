@@ -60,6 +60,7 @@ LATE = {
             *("decisions.why.postmortem", "decisions.why.verdict", "verbs.facts.lives"),
         },
         "verbs.facts.recorded": {"adapters.bus.systemd", "verbs.facts.cells"},
+        "verbs.facts.restarts": {"decisions.life.states"},
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
