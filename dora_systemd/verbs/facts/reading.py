@@ -19,7 +19,6 @@ from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_table, read_times
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.restarts import read_restarts, without_refused
 
 if TYPE_CHECKING:  # the table of `list` does without
     from dora_systemd.decisions.cell.owed import Owed
@@ -100,7 +99,11 @@ def read_dataflow(
         unit = known | manager.read(cell.unit, _missing(cell, status, path, known, is_row))
     else:
         unit = manager.read(cell.unit, _ALL if cell.is_up else (*_ALL, ENDED))
-    unit |= {"NRestarts": without_refused(manager, cell, unit["NRestarts"])}
+    if unit["NRestarts"]:
+        # Imported late: most dataflows have never been restarted.
+        from dora_systemd.verbs.facts.restarts import without_refused
+
+        unit["NRestarts"] = without_refused(manager, cell, unit["NRestarts"])
     if not cell.is_up or not (path or unit["ControlGroup"]):
         return Reading(cell, unit, status, problem)
     path = path or cgroup.group_path(unit["ControlGroup"])
@@ -117,6 +120,7 @@ def read_dataflow(
 def _read_held(manager: Manager, cell: Cell) -> Reading:
     # Imported late: few dataflows need anything, and those that run have it.
     from dora_systemd.verbs.facts.held import read_held
+    from dora_systemd.verbs.facts.restarts import read_restarts
 
     unit = {"NRestarts": read_restarts(manager, cell)}
     return Reading(cell, unit, at_us=_monotonic_us(), held=read_held(manager, cell))

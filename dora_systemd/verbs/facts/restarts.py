@@ -1,6 +1,7 @@
 """Counts the automatic restarts of a dataflow by systemd that have happened."""
 
 from dora_systemd.adapters.bus.manager import SETTLED, Manager
+from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.verbs.facts.cells import Cell
 
 
@@ -17,8 +18,5 @@ def without_refused(manager: Manager, cell: Cell, counted: int) -> int:
     """
     if not counted or cell.state.active in SETTLED:
         return counted
-    # Imported late: few dataflows have been restarted and are down.
-    from dora_systemd.decisions.life.states import RunnerExit
-
     status = manager.read(cell.unit, ["ExecMainStatus"])["ExecMainStatus"]
     return counted - 1 if status == RunnerExit.RESTARTS_SPENT else counted

@@ -43,5 +43,15 @@ def ensure_linger(scope: Scope) -> str:
     )
 
 
+def linger_note(scope: Scope) -> str:
+    """A warning that the dataflow ends at logout, or ""."""
+    if not scope.is_user or is_lingering(scope) is not False:
+        return ""
+    return (
+        f"it ends when {_user_name(scope)} logs out; "
+        f"to keep it running, as root: {linger_command(scope)}"
+    )
+
+
 def _user_name(scope: Scope) -> str:
     return user_name(scope.uid, nameless="")

@@ -8,13 +8,12 @@ addresses and ports. So a dataflow needs a private network namespace to be prote
 from collections.abc import Iterator
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.files import read_text
 from dora_systemd.decisions.settings.sandbox import NETWORK
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.names import SLICE
-from dora_systemd.scope import Scope
+from dora_systemd.scope import RUNTIME_NAME, Scope
+from dora_systemd.trust.paths import exists
 from dora_systemd.verbs.start.plan import Plan
 
 PASSWD = Path("/etc/passwd")
@@ -39,9 +38,12 @@ def login_users(passwd: str) -> list[str]:
     ]
 
 
-def has_run_here(manager: Manager) -> bool:
-    """Whether a dataflow has been started since the boot: its slice stays active after its end."""
-    return bool(manager.read(SLICE, ["ActiveState"])["ActiveState"] == "active")
+def has_run_here(scope: Scope) -> bool:
+    """Whether a dataflow has been started since the boot; of a user, since the manager began.
+
+    systemd keeps the parent of RuntimeDirectory= of all dataflows after their end.
+    """
+    return exists(scope.runtime_root / RUNTIME_NAME)
 
 
 def start_notes(plan: Plan, passwd: Path = PASSWD) -> Iterator[str]:

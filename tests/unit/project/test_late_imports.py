@@ -60,7 +60,6 @@ LATE = {
             *("decisions.why.postmortem", "decisions.why.verdict", "verbs.facts.lives"),
         },
         "verbs.facts.recorded": {"adapters.bus.systemd", "verbs.facts.cells"},
-        "verbs.facts.restarts": {"decisions.life.states"},
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
@@ -89,12 +88,12 @@ LATE = {
         "cli.parameters": {"decisions.views.objects"},
         "decisions.views.outcome": {"decisions.views.objects"},
     },
-    "most dataflows owe nothing, wait for nothing, and run on one machine": {
+    "most dataflows owe nothing, wait for nothing, never restarted, and run on one machine": {
         "adapters.dora.preparation": {"adapters.dora.probe", "decisions.machines.part"},
         "runner.owes.begin": {"runner.owes.watch"},
         "verbs.facts.reading": {
             *("decisions.machines.usage", "decisions.owes.feeds", "decisions.owes.probe"),
-            "verbs.facts.held",
+            *("verbs.facts.held", "verbs.facts.restarts"),
         },
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {

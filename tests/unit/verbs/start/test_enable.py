@@ -24,7 +24,7 @@ from dora_systemd.verbs.start.enable import (
     install_unit_file,
     read_boot_unit,
 )
-from dora_systemd.verbs.start.linger import ensure_linger
+from dora_systemd.verbs.start.linger import ensure_linger, linger_note
 from dora_systemd.verbs.stop import stop_cells
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_program
@@ -253,6 +253,24 @@ def test_linger(
     monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
     assert note in ensure_linger(Scope(is_user=True, uid=0))
     assert (note == "") == (ensure_linger(Scope(is_user=False, uid=0)) == note)
+
+
+@pytest.mark.parametrize(
+    ("answer", "is_user", "note"),
+    [
+        ("no", True, "it ends when root logs out; "),
+        ("no", False, ""),
+        ("yes", True, ""),
+        ("", True, ""),
+    ],
+)
+def test_a_start_warns_that_logout_ends_it(
+    answer: str, is_user: bool, note: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_program(tmp_path / "bin/loginctl", f"echo {answer}")
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
+    remedy = "to keep it running, as root: loginctl enable-linger root"
+    assert linger_note(Scope(is_user=is_user, uid=0)) == (note and note + remedy)
 
 
 CHECKED = "[Install]\nWantedBy=multi-user.target\nRequiredBy=boot-complete.target\n"

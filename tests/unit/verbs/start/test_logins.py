@@ -7,9 +7,14 @@ import pytest
 
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.start.logins import judge_logins, login_users, start_notes
+from dora_systemd.verbs.start.logins import (
+    has_run_here,
+    judge_logins,
+    login_users,
+    start_notes,
+)
 from dora_systemd.verbs.start.plan import Plan
-from tests.unit.fakes.manager import options
+from tests.unit.fakes.manager import ScopeIn, options
 
 PASSWD = """root:x:0:0:root:/root:/bin/bash
 dora:x:990:990::/:/usr/sbin/nologin
@@ -69,3 +74,11 @@ def test_one_user_alone(passwd: Path, tmp_path: Path) -> None:
     assert not list(judge_logins(SYSTEM, passwd))
     assert not list(start_notes(plan("dora"), tmp_path / "none"))
     assert not list(judge_logins(USER, passwd))
+
+
+def test_the_gateway_is_no_dataflow(tmp_path: Path) -> None:
+    scope = ScopeIn(is_user=True, uid=1000, root=tmp_path)
+    (tmp_path / "dora-systemd-gateway").mkdir()
+    assert not has_run_here(scope)
+    (tmp_path / "dora-systemd").mkdir()
+    assert has_run_here(scope)
