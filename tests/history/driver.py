@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.releases.store import store_root
+from dora_systemd.decisions.cell.asked import is_stopped
+from dora_systemd.decisions.cell.status import NodeStatus
 from tests.history import member
 from tests.history.history import Answer, History, Look
 from tests.history.recorder import (
@@ -211,11 +213,17 @@ def _state_of(cell: str) -> dict[str, str]:
     path = Cell(cell).paths.status
     status = Cell(cell).status if path.exists() else None
     states = status.nodes.values() if status else ()
-    found["nodes"] = " ".join(node.state for node in states)
+    found["nodes"] = " ".join(map(_word, states))
     # A node can have died a moment before the runner hears of it.
     found["pids"] = str({at: one for at, one in pids_of(found).items() if at.startswith("node-")})
     found["stage"] = status.stage if status else ""
     return found
+
+
+def _word(node: NodeStatus) -> str:
+    """Its state; a node that was stopped has its grace duration to end."""
+    is_ending = is_stopped(node) and node.pid and not node.is_held
+    return "stopping" if is_ending else node.state
 
 
 def _is_steady(state: dict[str, str]) -> bool:

@@ -46,6 +46,11 @@ class Target:
     grace: int
 
     @property
+    def patience(self) -> int:
+        """µs until dora sends SIGTERM: dora's message to stop does not reach a node that starts."""
+        return 0 if self.status.state == "starting" else self.grace
+
+    @property
     def has_process(self) -> bool:
         """Whether its program may run. The head of several machines knows no pid of others."""
         return self.status.state in ("starting", "ready", "running", "reloading")
@@ -102,7 +107,7 @@ class Hand:
     async def _remove(self, target: Target) -> None:
         node = target.node
         self._removed.add(node)
-        await self._ask(protocol.node_params("RemoveNode", self._run, node, target.grace))
+        await self._ask(protocol.node_params("RemoveNode", self._run, node, target.patience))
         if target.status.state == "waiting":
             self.run.nodes.gates.leave(node)
 
@@ -126,7 +131,7 @@ class Hand:
                 await self._end("RestartNode", target)
 
     async def _end(self, method: str, target: Target) -> None:
-        await self._ask(protocol.node_params(method, self._run, target.node, target.grace))
+        await self._ask(protocol.node_params(method, self._run, target.node, target.patience))
         await self._wait(target.node, _has_ended, target.grace)
 
     async def _wait(self, node: str, is_so: Callable[[NodeStatus], bool], grace: int) -> None:

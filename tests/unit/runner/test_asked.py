@@ -21,6 +21,7 @@ from dora_systemd.runner.cell.role import Alone
 from dora_systemd.runner.nodes.gate import Gates
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
+from dora_systemd.values import SECOND
 from tests.unit.fakes.reload import ReloadBench
 
 RUNNING = NodeStatus("running", 7, policy="on-failure", max_restarts=2)
@@ -178,6 +179,24 @@ def test_a_stopped_node_is_stopped_until_it_is_restarted(
     assert (bench.status(node).state, bench.status(node).asked) == ("running", "")
     assert not bench.is_gated(node)
     assert "node-crashed" not in bench.events()
+
+
+@pytest.mark.parametrize(("state", "secs"), [("starting", 0), ("running", 10)])
+@pytest.mark.parametrize("what", ["stop", "restart"])
+def test_a_node_that_starts_gets_no_time_for_a_message_that_does_not_reach_it(
+    tmp_path: Path, state: str, secs: int, what: str
+) -> None:
+    async def scene(bench: AskedBench) -> None:
+        await bench.ask(what, "c", grace=10 * SECOND)
+
+    bench = run(tmp_path, scene, c=RUNNING._replace(state=state))
+    assert bench.dora.asked[0] == {
+        "RemoveNode": {
+            "dataflow_id": "run",
+            "node_id": "c",
+            "grace_duration": {"secs": secs, "nanos": 0},
+        }
+    }
 
 
 def test_a_node_that_becomes_ready_after_its_stop(tmp_path: Path) -> None:
