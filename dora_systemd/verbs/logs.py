@@ -45,7 +45,9 @@ def read_logs(
 
     Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not accept.
     """
-    arguments = query_arguments(_oldest_first(query))
+    # What commands a terminal is escaped here, so nothing need be left out.
+    shown = replace(query, want_unprintable=True)
+    arguments = query_arguments(_oldest_first(shown))
     for data in journal_output(arguments, want_colors=want_colors):
         yield terminal.feed(data)
         if query.is_follow:
@@ -53,15 +55,23 @@ def read_logs(
     yield terminal.flush()
 
 
-def pass_logs(query: LogQuery, fd: int) -> int:
+_LEFT_OUT = b" blob data]\n"
+"""What journalctl prints in the place of a message with control characters ends with this."""
+
+
+def pass_logs(query: LogQuery, fd: int, on_left_out: Callable[[], object] | None = None) -> int:
     """Write the records of a query to `fd` as journalctl prints them; its exit status.
 
+    on_left_out: called once if journalctl has left out the text of a message.
     Raises DoraSystemdError as read_logs does, and OSError for `fd`: journalctl ignores a full disk.
     """
     with open_journalctl(query_arguments(_oldest_first(query))) as child:
         assert child.stdout
         while data := os.read(child.stdout.fileno(), CHUNK):
             write_whole(data, fd)
+            if on_left_out is not None and _LEFT_OUT in data:
+                on_left_out()
+                on_left_out = None
         return end_journalctl(child)
 
 

@@ -16,6 +16,7 @@ import pytest
 from dora_systemd.decisions.logs.events import EVENTS
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.terminal import shown
 
 LINES = int(os.environ.get("DORA_LOG_LINES", "30000"))
 OURS = re.compile(r"\d{8} flood$|last \d{8}$|half a line$")
@@ -155,6 +156,7 @@ out = sys.stdout.buffer
 out.write(b"binary \x00\xff\x1b[31m\n" + b"x" * (1 << 20) + b"\n" + b"y" * (3 << 20) + b"\n")
 out.write("ünïcode\r\n".encode() + b"\n")
 out.flush()
+sys.stderr.buffer.write(b"\r 1%|#\r 2%|##\rcaf\xe9 \n")
 print("on stderr", file=sys.stderr, flush=True)
 """
 
@@ -174,10 +176,17 @@ def test_odd_lines(cell: Cell, project: Project) -> None:
     assert [piece.get("DORA_CUT") for piece in pieces] == ["1", "1", None]
     assert (text["MESSAGE"], text["PRIORITY"]) == ("ünïcode", "6")
     assert empty["MESSAGE"] == ""
-    (stderr,) = [r for r in records if r["DORA_STREAM"] == "stderr"]
+    *steps, stderr = [r for r in records if r["DORA_STREAM"] == "stderr"]
+    assert [step["MESSAGE"] for step in steps] == [" 1%|#", " 2%|##", [*b"caf\xe9 "]]
     assert (stderr["MESSAGE"], stderr["PRIORITY"]) == ("on stderr", "5")
     assert stderr["SYSLOG_IDENTIFIER"] == f"{cell.name}/odd"
     assert int(stderr["DORA_NODE_PID"]) > 1
+    words = ("doractl", cell.scope.flag, "logs", cell.name, "--no-pager")
+    assert r"caf\xe9 " in shown(*words)
+    done = run(*words)
+    assert "B blob data]" in done.stdout
+    note = "doractl: some messages have control characters; --all prints them, too\n"
+    assert done.stderr == note
 
 
 @pytest.mark.lab

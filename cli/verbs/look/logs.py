@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import click
@@ -36,6 +37,7 @@ Lines = TerminalLines | ShownLines | None
 _BOOT_OPTION = re.compile("-[afqr]*b|--boot")
 _COUNT = re.compile("[0-9]+")
 _OLD_NODE = re.compile(r"[A-Za-z0-9_.*?\[][A-Za-z0-9_.*?\[\]!-]*")
+_LEFT_OUT = "some messages have control characters; --all prints them, too"
 _OLD_N = "-n is the number of lines now, as in journalctl; for a node use --node {}"
 
 
@@ -137,7 +139,7 @@ class LogsCommand(click.Command):
     "--all",
     "want_unprintable",
     is_flag=True,
-    help="Include messages with control characters: escaped on a terminal, unchanged in a pipe.",
+    help="In a pipe, print messages with control characters unchanged; a terminal shows them.",
 )
 @click.option(
     "-o",
@@ -252,7 +254,8 @@ def _lines(journal: JournalReader, query: LogQuery) -> Lines:
 def _print(query: LogQuery, lines: Lines) -> int:
     """Print the records of a query, formatted for a terminal, or by journalctl itself."""
     if lines is None:
-        return pass_logs(query, sys.stdout.fileno())
+        note = None if query.is_quiet else partial(print_warnings, [_LEFT_OUT])
+        return pass_logs(query, sys.stdout.fileno(), note)
     _write(read_logs(query, lines, wants_colors(sys.stdout)), sys.stdout.fileno())
     return ExitCode.OK
 

@@ -19,6 +19,7 @@ ERR, WARNING, NOTICE, INFO, DEBUG = 3, 4, 5, 6, 7
 PRIORITIES = {"error": ERR, "warn": WARNING, "info": INFO, "debug": DEBUG, "trace": DEBUG}
 PLAIN_PRIORITY = {"stdout": INFO, "stderr": NOTICE}
 
+_RETURNS = re.compile(r"\r+")
 _TOO_DEEP = "[nested too deeply]"
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _TRACING = re.compile(
@@ -34,8 +35,8 @@ class Piece(bytes):
 class LineSplitter:
     """Splits bytes into lines. A line above `limit` bytes yields several `Piece`s and the rest.
 
-    Removes the newline, and one carriage return before it, as dora does. All other bytes pass
-    unchanged, even NUL. rest: the bytes after the last newline.
+    A carriage return ends a line, too, so each step of a progress bar is one; an empty line needs a
+    newline. All other bytes pass unchanged, even NUL. rest: the bytes after the last line.
     """
 
     def __init__(self, limit: int = LINE_LIMIT) -> None:
@@ -45,14 +46,20 @@ class LineSplitter:
     def feed(self, data: bytes) -> list[bytes]:
         """The lines that `data` completes."""
         data = self.rest + data
-        lines = data.split(b"\n")
+        # The last carriage return may be half of "\r\n".
+        whole = data.removesuffix(b"\r")
+        lines = whole.split(b"\n")
+        if b"\r" in whole:
+            *ended, last = lines
+            *begun, rest = last.split(b"\r")
+            lines = [step for line in ended for step in _steps(line.removesuffix(b"\r"))]
+            lines += [*filter(None, begun), rest]
         self.rest = lines.pop()
         if len(data) > self.limit:
             lines = [piece for line in lines for piece in self._cut(line)]
             *pieces, self.rest = self._cut(self.rest)
             lines += pieces
-        if b"\r\n" in data:
-            lines = [line if type(line) is Piece else line.removesuffix(b"\r") for line in lines]
+        self.rest += data[len(whole) :]
         return lines
 
     def _cut(self, line: bytes) -> list[bytes]:
@@ -63,8 +70,14 @@ class LineSplitter:
 
     def flush(self) -> list[bytes]:
         """The bytes after the last newline, as a `Piece`: call this after the writer has ended."""
-        rest, self.rest = self.rest, b""
+        rest, self.rest = self.rest.removesuffix(b"\r"), b""
         return [Piece(rest)] if rest else []
+
+
+def _steps(line: bytes) -> list[bytes]:
+    """The parts of a line between carriage returns: the last one, and those that are not empty."""
+    *begun, last = line.split(b"\r")
+    return [*filter(None, begun), last]
 
 
 @dataclass(frozen=True)
@@ -145,7 +158,7 @@ def jsonl_fields(line: bytes) -> dict[str, Value]:
     try:
         record = json.loads(line)
         stream, level = _text(str(record["stream"] or "stdout")), str(record["level"])
-        text = _text(record["msg"])
+        text = _RETURNS.sub("\n", _text(record["msg"]).strip("\r"))
         own = _record_fields({**record, "timestamp": record.get("ts"), "message": text})
     except (ValueError, RecursionError, TypeError, KeyError):
         return {"PRIORITY": INFO, "MESSAGE": line}

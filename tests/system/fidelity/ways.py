@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -47,7 +48,10 @@ def lines_of(printed: str) -> Iterator[tuple[str, str]]:
         record = json.loads(line) if line.startswith("{") else {}
         if record.get("node_id") and not str(record["target"]).startswith(_OTHERS):
             fields = json_fields(record["message"].encode()) or {}
-            yield record["node_id"], str(fields.get("MESSAGE", record["message"]))
+            message = str(fields.get("MESSAGE", record["message"]))
+            # A carriage return ends a line in the journal, or is a newline in a record.
+            for part in re.split("[\r\n]", message):
+                yield record["node_id"], part
 
 
 def _is_err(line: str) -> bool:

@@ -13,11 +13,12 @@ import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.query import UNIT_ENDS, LogQuery, query_matches
+from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.recorded import find_query, find_soon
 from dora_systemd.verbs.follow import UnitWatch
-from dora_systemd.verbs.logs import FollowedLog, pass_logs
+from dora_systemd.verbs.logs import FollowedLog, pass_logs, read_logs
 from tests.unit.fakes.library import fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import FakeManager, options
 from tests.unit.fakes.programs import make_program
@@ -220,6 +221,33 @@ def test_found_lines_come_in_the_order_of_time(
     if is_asked:
         assert "--lines=2" in first[0]
         assert "--since=@3.000000 --until=@5.000000 --grep=x --" in last
+
+
+@pytest.mark.parametrize(
+    ("printed", "count"),
+    [
+        (b"lab robot/a[1]: [12B blob data]\n" * 3000, 1),
+        (b"lab robot/a[1]: [1.7K blob data]\n", 1),
+        (b"lab robot/a[1]: text\n", 0),
+    ],
+)
+def test_a_pipe_hears_once_what_journalctl_leaves_out(
+    printed: bytes, count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    fake_journalctl(monkeypatch, tmp_path, printed)
+    left_out: list[int] = []
+    with (tmp_path / "out").open("wb") as out:
+        pass_logs(QUERY, out.fileno(), lambda: left_out.append(1))
+    assert (len(left_out), (tmp_path / "out").read_bytes()) == (count, printed)
+
+
+def test_a_terminal_is_shown_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Escaped; without colours none of the nodes pass."""
+    line = b"Nov 21 01:02:59 lab robot/a[1]: caf\xe9 \x1b[31mred\x1b[0m \x1b]2;x\x07\n"
+    calls = fake_journalctl(monkeypatch, tmp_path, line)
+    shown = b"".join(read_logs(QUERY, TerminalLines(want_colors=False)))
+    assert shown == b"Nov 21 01:02:59 a caf\\xe9 red \\x1b]2;x\\x07\n"
+    assert "--all" in calls.read_text().split()
 
 
 def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
