@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from signal import SIGABRT
 from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.dora.preparation import Prepared
@@ -19,8 +20,10 @@ from dora_systemd.adapters.runner_socket.client import Request
 from dora_systemd.adapters.runner_socket.door import Door
 from dora_systemd.adapters.runner_socket.listener import Session, refuse
 from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
@@ -65,7 +68,7 @@ _AGAIN_SECONDS = 0.05
 _LOOK_SECONDS = 0.2
 _WATCH_SECONDS = 2.0
 _WORD_SECONDS = 1.0
-"""Time for a member to say itself why its daemon is gone."""
+"""Time for a member to say itself why its daemon is gone, or what a node has done."""
 _EXTEND_SECONDS = 10.0
 _NOTE_SECONDS = 0.05
 """Time for dora to say that an exit is of a process that it has replaced: its next words."""
@@ -318,19 +321,27 @@ class HeadDialogue(Dialogue):
     def _hear_elsewhere(self, record: protocol.LogRecord) -> None:
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
+            self._tell_exit(event.node)
             event = replace(event, pid=0)  # here another process has that number
         if isinstance(event, life.NodeExited):
             essential = is_essential(self._options.node_rights, event.node)
             self._exits[event.node] = life_events.with_facts(event, False, None, essential)
-            self._loop.call_later(_NOTE_SECONDS, self._tell_exit, event.node)
+            wait = _WORD_SECONDS if self._is_unexplained(event.node) else _NOTE_SECONDS
+            self._loop.call_later(wait, self._tell_exit, event.node)
         elif event is not None:
             self._pump.push(event)
+
+    def _is_unexplained(self, node: str) -> bool:
+        """Whether its member may have ended it, and has not said so yet: that comes another way."""
+        event, status = self._exits.get(node), self._pump.cell.nodes.get(node, NodeStatus())
+        return event is not None and event.exit == exit_of(-SIGABRT) and not status.hung
 
     def _hear(self, record: protocol.LogRecord) -> None:
         """Handle what dora says: that an exit was of an old process it says next."""
         is_stale = life_events.is_note_of_stale(record)
         for node in [record.node] if record.node else list(self._exits):
-            self._tell_exit(node, is_stale)
+            if is_stale or not self._is_unexplained(node):
+                self._tell_exit(node, is_stale)
         super()._hear(record)
 
     def _tell_exit(self, node: str, is_stale: bool = False) -> None:

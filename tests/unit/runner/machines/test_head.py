@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
+
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -327,6 +329,27 @@ def test_a_pid_of_another_machine_means_nothing_here(tmp_path: Path) -> None:
         assert bench.heard(life.NodeSpawned) == [life.NodeSpawned(0, "mid", 0)]
         assert bench.heard(life.NodeExited) == [life.NodeExited(0, "mid", exit_of(-9), False)]
         assert bench.nodes.calls == [], "no process here is touched"
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("next_words", ["its next words", "spawned node with pid 9"])
+def test_an_abort_waits_for_the_word_of_the_member(tmp_path: Path, next_words: str) -> None:
+    """The member says by another way that the node has missed its watchdog."""
+    said = "handling node stop with exit status Signal(6) (restart: false"
+
+    async def work(bench: Bench) -> None:
+        bench.be(State.RUNNING)
+        bench.dialogue._hear(LogRecord("DEBUG", *MID, said))
+        bench.dialogue._hear(LogRecord("DEBUG", *MID, next_words))
+        is_spawned = next_words.startswith("spawned")
+        assert bool(bench.heard(life.NodeExited)) is is_spawned, "a new process is its next life"
+        other = await bench.link(wire.Hung("mid", "no WATCHDOG=1 for 2s", "node-watchdog"))
+        await asyncio.sleep(1.1)
+        kinds = [type(one) for one in bench.pump.heard if one]
+        assert kinds.count(life.NodeExited) == 1
+        assert is_spawned or kinds.index(life.NodeHung) < kinds.index(life.NodeExited)
+        other.say(wire.Beat())
 
     run(tmp_path, work)
 
