@@ -227,8 +227,9 @@ def _limit(value: int | None) -> int | None:
 def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> NodeRow:
     if status is None:
         return NodeRow(node, "unknown", **numbers)
+    pid = 0 if status.is_held else status.pid
     facts = {
-        "pid": 0 if status.is_held else status.pid,
+        "pid": pid,
         "restarts": status.restarts,
         "max_restarts": status.max_restarts or None,
         "exit": str(status.exit),
@@ -238,4 +239,5 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "machine": status.machine,
         "stopped_by": status.asked_by if is_stopped(status) else "",
     }
-    return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]
+    state = "stopping" if is_stopped(status) and pid else status.state
+    return NodeRow(node, state, **facts, **numbers)  # type: ignore[arg-type]

@@ -71,6 +71,27 @@ def write_status(scope: Scope, status: CellStatus, name: str = "robot") -> None:
     (directory / "status.json").write_text(status.to_json())
 
 
+@pytest.mark.parametrize(
+    ("before", "shown"),
+    [
+        (NodeStatus("stopped", 42, asked="stop"), ("stopping", 42)),
+        (NodeStatus("stopped", 0, asked="stop"), ("stopped", 0)),
+        (NodeStatus("stopped", 42, asked="stop", is_held=True), ("stopped", 0)),
+        (NodeStatus("stopped", 42), ("stopped", 42)),
+    ],
+    ids=["its process ends", "ended", "its launcher waits", "with the dataflow"],
+)
+@pytest.mark.usefixtures("unit_group")
+def test_a_node_is_stopped_when_its_process_has_ended(
+    scope: Scope, before: NodeStatus, shown: tuple[str, int]
+) -> None:
+    manager = FakeManager()
+    manager.add(options(), ControlGroup=GROUP)
+    write_status(scope, CellStatus(nodes={"camera": before}))
+    (camera,) = row_of(manager, scope).nodes
+    assert (camera.state, camera.pid) == shown
+
+
 @pytest.mark.usefixtures("unit_group")
 def test_running_dataflow(scope: Scope) -> None:
     manager = FakeManager()
