@@ -10,15 +10,16 @@
 #   sd_watchdog_enabled(3); :any behind that: another process of the node may feed it.
 # Environment: DORA_SYSTEMD_CELL (RuntimeDirectory), DORA_SYSTEMD_GROUP (cgroup of the unit),
 # DORA_SYSTEMD_LIBEXEC (first entry of PATH), DORA_SYSTEMD_UNSET (names), DORA_SYSTEMD_RIGHTS (lines
-# NODE WORD..., the programs that set the rights of the node or of "*", all others).
+# NODE WORD..., the programs that set the rights of the node or of "*", all others),
+# DORA_SYSTEMD_SIGACTION (number of rt_sigaction(2) on this machine).
 #
 # Perl, because a shell drops variables with names such as "my.var" and sets others (PWD, OLDPWD),
 # and because Python takes six times as long and ignores signals. No modules: "use strict" would
 # double the time.
 
 my ($node, $directory, $output, @command) = @ARGV;
-my ($cell, $group, $libexec, $unset, $rights) =
-    delete @ENV{map "DORA_SYSTEMD_$_", qw(CELL GROUP LIBEXEC UNSET RIGHTS)};
+my ($cell, $group, $libexec, $unset, $rights, $sigaction) =
+    delete @ENV{map "DORA_SYSTEMD_$_", qw(CELL GROUP LIBEXEC UNSET RIGHTS SIGACTION)};
 # KEEP is from runners of older versions.
 delete @ENV{split(' ', $unset), map "DORA_SYSTEMD_$_", qw(DIRECTORY PYTHON KEEP)};
 
@@ -69,6 +70,12 @@ unless (exists $ENV{ZENOH_CONFIG} or exists $ENV{DORA_ZENOH_CONFIG_OVERLAY} or n
 }
 if (defined $rights and ($rights =~ /^\Q$node\E (.*)$/m or $rights =~ /^\* (.*)$/m)) {
     unshift @command, split ' ', $1;
+}
+# RestrictNamespaces= forbids clone3(2), and without it posix_spawn(3) of the daemon makes its children
+# ignore the signals that glibc keeps for itself. Only the system call gives their default back.
+if ($sigaction) {
+    my $default = "\0" x 32;
+    syscall($sigaction + 0, $_, $default, 0, 8) for 32, 33;
 }
 exec { $command[0] } @command;
 fail($! == 2 ? 127 : 126, $command[0]);  # ENOENT, as in a shell

@@ -14,6 +14,8 @@ from tests.system.cells import Cell, Project, run
 PROBE = """
 import json, os, sys
 seen = {"argv": sys.argv, "cwd": os.getcwd(), "env": dict(os.environ)}
+status = open("/proc/self/status").read()
+seen["ignored"] = int(status.split("SigIgn:")[1].split()[0], 16) >> 31
 with open(os.path.join("SEEN", os.environ["PROBE"]), "w") as file:
     json.dump(seen, file)
 from dora import Node
@@ -91,6 +93,7 @@ def test_arguments_directory_and_environment(flow: Path) -> None:
     for case in cases:
         assert ours[case]["argv"] == bare[case]["argv"], case
         assert ours[case]["cwd"] == bare[case]["cwd"], case
+        assert ours[case]["ignored"] == bare[case]["ignored"] == 0, "signals of glibc"
     assert ours["path-here"]["env"]["RUST_LOG"] == bare["path-here"]["env"]["RUST_LOG"] == "warn"
     for name, variables in VARIABLES.items():
         case = f"env-{name}"

@@ -19,6 +19,7 @@ ERR, WARNING, NOTICE, INFO, DEBUG = 3, 4, 5, 6, 7
 PRIORITIES = {"error": ERR, "warn": WARNING, "info": INFO, "debug": DEBUG, "trace": DEBUG}
 PLAIN_PRIORITY = {"stdout": INFO, "stderr": NOTICE}
 
+_ENDS = re.compile(rb"[\r\n]")
 _RETURNS = re.compile(r"\r+")
 _TOO_DEEP = "[nested too deeply]"
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
@@ -45,6 +46,11 @@ class LineSplitter:
 
     def feed(self, data: bytes) -> list[bytes]:
         """The lines that `data` completes."""
+        # A long line comes in many chunks: do not look through what is there for each of them.
+        is_short = len(self.rest) + len(data) <= self.limit
+        if is_short and not _ENDS.search(data) and self.rest[-1:] != b"\r":
+            self.rest += data
+            return []
         data = self.rest + data
         # The last carriage return may be half of "\r\n".
         whole = data.removesuffix(b"\r")

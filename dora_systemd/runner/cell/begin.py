@@ -15,6 +15,9 @@ from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.paths import CellPaths
 
+_SIGACTIONS = {"x86_64": "13", "aarch64": "134", "riscv64": "134"}
+SIGACTION = {"DORA_SYSTEMD_SIGACTION": _SIGACTIONS.get(os.uname().machine, "")}
+"""For launcher.pl: the number of rt_sigaction(2)."""
 LIBEXEC = Path(__file__).parents[2] / "libexec"
 OPENSSL = ("ssl", "_ssl", "_hashlib")
 
@@ -107,6 +110,7 @@ def daemon_variables(
         "DORA_SYSTEMD_PYTHON": find_python(options.venv, search_path, os.path.exists),
         "PATH": f"{LIBEXEC}:{search_path}",
         **_rights(options, unit),
+        **SIGACTION,
     }
 
 

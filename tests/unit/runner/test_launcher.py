@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import dora_systemd
+from dora_systemd.runner.cell.begin import SIGACTION
 from tests.unit.fakes.programs import make_program
 
 PACKAGE = Path(dora_systemd.__file__).parent
@@ -59,6 +60,21 @@ def test_the_node_gets_group_pipes_directory_and_environment(
     assert "PATH=/usr/bin:/bin" in said
     left = [line for line in said if line.startswith(("DORA_", "RUST_"))]
     assert left == [f"DORA_ZENOH_CONFIG_OVERLAY={PACKAGE}/zenoh.json5"]
+
+
+def test_the_node_ignores_no_signal_of_glibc(environment: dict[str, str], tmp_path: Path) -> None:
+    """As posix_spawn(3) of dora's daemon makes it, without clone3(2)."""
+    number = SIGACTION["DORA_SYSTEMD_SIGACTION"]
+    ignore = f"syscall({number}, $_, my $act = pack('Q4', 1, 0, 0, 0), 0, 8)"
+    run = f"{ignore} for 32, 33; exec @ARGV"
+    words = ("one", str(tmp_path), "keep", "/bin/grep", "SigIgn", "/proc/self/status")
+    begin = ("/usr/bin/perl", "-e", run)
+    before = launch(environment, *begin, *words[3:]).stdout.split()[1]
+    own = {**environment, **SIGACTION}
+    done = launch(own, *begin, "/usr/bin/perl", str(PACKAGE / "launcher.pl"), *words)
+    after = done.stdout.split()[1]
+    assert (int(before, 16) >> 31, int(after, 16) >> 31) == (3, 0)
+    assert done.stderr == ""
 
 
 def test_the_node_is_in_its_group_while_it_waits_for_its_pipes(

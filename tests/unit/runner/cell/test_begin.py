@@ -17,6 +17,7 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import (
     LIBEXEC,
     OPENSSL,
+    SIGACTION,
     daemon_variables,
     enter_supervisor,
     leave_out_openssl,
@@ -85,6 +86,7 @@ def test_what_the_daemon_and_the_launcher_are_told(
         "DORA_SYSTEMD_DIRECTORY": "/srv/robot",
         "DORA_SYSTEMD_PYTHON": python,
         "PATH": f"{LIBEXEC}:/opt/bin",
+        **SIGACTION,
     }
     assert variables(paths, {}, runner)["PATH"] == f"{LIBEXEC}:{os.defpath}"
     monkeypatch.setenv("RUST_BACKTRACE", "full")
