@@ -4,6 +4,7 @@ A step begins when the steps that it names have ended, so some run at the same t
 time of a test is waiting. What they print is shown one step after the other, in the plan's order.
 """
 
+import os
 import re
 import subprocess
 import sys
@@ -42,11 +43,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Result:
-    """How a step ended. summary: pytest's, or "done"."""
+    """How a step ended. summary: pytest's, or "done". cpu: seconds of processor time, of all that
+    it has started and waited for; a lab waits for all of its container or machine."""
 
     name: str
     status: int
     summary: str
+    cpu: float = 0.0
 
 
 def run_steps(steps: Sequence[Step]) -> int:
@@ -107,7 +110,7 @@ def say_results(results: Sequence[Result], seconds: float) -> None:
     """One line for each step, and one for all, as pytest writes it."""
     for result in results:
         word = f"FAILED with exit status {result.status}" if result.status else "ok"
-        say(f"{result.name}: {word}; {result.summary}")
+        say(f"{result.name}: {word}; {result.summary}; {result.cpu:.0f} s of processor time")
     sys.stderr.flush()
     print(f"===== {total(results)} in {seconds:.2f}s =====", flush=True)
 
@@ -139,6 +142,7 @@ class Running:
         self._before = before
         self._output = TemporaryFile("w+")  # noqa: SIM115 - open as long as the step
         self._status = 0
+        self._cpu = 0.0
         self._error: LabError | None = None
         self._has_ended = Event()
         # The kernel tells the step when this thread dies, so it stays until the step has ended.
@@ -157,7 +161,11 @@ class Running:
     def _call(self) -> int:
         command = die_with_parent(self.step.command, "TERM")
         env = self.step.env()
-        return subprocess.call(command, env=env, cwd=self.step.cwd, stdout=self._output)
+        process = subprocess.Popen(command, env=env, cwd=self.step.cwd, stdout=self._output)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        self._cpu = usage.ru_utime + usage.ru_stime
+        return process.returncode
 
     def finish(self) -> Result:
         """How it ended, when it has ended and all is shown. Raises LabError."""
@@ -170,7 +178,7 @@ class Running:
         if self._error:
             raise self._error
         status = self._status
-        return Result(self.step.name, status if status >= 0 else 128 - status, summary)
+        return Result(self.step.name, status if status >= 0 else 128 - status, summary, self._cpu)
 
     def _parts(self) -> Iterator[str]:
         """What it prints, as it comes: lines, and beginnings of lines."""

@@ -179,7 +179,19 @@ def test_all_steps_run_and_the_worst_status_counts(capfd: pytest.CaptureFixture[
     assert "step 0: ok; done" in said
     assert "step 1: FAILED with exit status 1; 2 failed, 1 passed in 1.00s" in said
     assert "step 2: FAILED with exit status 143; done" in said
+    assert said.count(" s of processor time") == 3
     assert re.fullmatch(r"===== 3 failed, 1 passed in \d+\.\d\ds =====", out.splitlines()[-1])
+
+
+def test_the_processor_time_of_a_step_is_that_of_all_it_waits_for(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    busy = "import time\nwhile time.process_time() < 1.1: pass"
+    command = ["sh", "-c", f"{sys.executable} -c '{busy}'"]
+    run_steps([Step("busy", command, os.environ.copy), Step("idle", ["true"], os.environ.copy)])
+    said = capfd.readouterr().err
+    assert re.search(r"busy: ok; done; [12] s of processor time", said)
+    assert "idle: ok; done; 0 s of processor time" in said
 
 
 STEPS = """
