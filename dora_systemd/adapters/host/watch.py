@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import errno
 import os
+import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -49,6 +50,17 @@ def identity(path: str) -> Identity | None:
         return None
 
 
+class Since(NamedTuple):
+    """The start of a run of the dataflow, which the first look at its files compares with.
+
+    at_ns: CLOCK_MONOTONIC, before the run reads any file. known: returns the versions of files that
+    the run was started from; the first look calls it, in a thread.
+    """
+
+    at_ns: int
+    known: Callable[[], Iterable[tuple[str, Identity | None]]] = tuple
+
+
 def watch_rules(options: RunnerOptions) -> WatchRules:
     """The rules for files that cause a reload; reads the .gitignore files now."""
     root, given = options.working_directory, options.reload
@@ -62,19 +74,23 @@ async def changed_files(
     on_seen: Callable[[], object] = bool,
     has_moved: Callable[[], bool] = bool,
     idle_ms: int = IDLE_MS,
+    since: Since | None = None,
 ) -> AsyncIterator[frozenset[str]]:
     """Files that match `rules` and were written, created, renamed or deleted, in batches.
 
     Watches directories, not files, because editors save by renaming. Ignored directories cost
     nothing. on_seen: is called when each later change is noticed, if not at once. has_moved:
     whether a link leads elsewhere than to the root of the rules; is called from time to time, and
-    the root is reported then. idle_ms: as IDLE_MS. Raises DoraSystemdError if the kernel refuses
-    more watches.
+    the root is reported then. idle_ms: as IDLE_MS. since: also report files that were saved between
+    this moment and the first look; None: report only later changes. Raises DoraSystemdError if the
+    kernel refuses more watches.
     """
     seen = Seen(rules)
     # In a thread: a large tree takes seconds, and the loop of the runner feeds the watchdog.
-    await asyncio.to_thread(seen.missed)
+    early = await asyncio.to_thread(seen.first, since)
     on_seen()
+    if early:
+        yield early
     while True:
         await _wait_root(rules.root)
         is_unsure = True
@@ -101,6 +117,24 @@ class Seen:
         self._rules = rules
         self._seen: dict[str, Identity] = {}
         self._gone: set[str] = set()
+
+    def first(self, since: Since | None) -> frozenset[str]:
+        """Note how all files are now. Return those that have changed since the run began.
+
+        A file whose version at the start is known is compared with that version. Of any other file
+        only the time of its last change is known.
+        """
+        self.missed()
+        return frozenset() if since is None else self._changed_since(since)
+
+    def _changed_since(self, since: Since) -> frozenset[str]:
+        known = [one for one in since.known() if self._rules.has(one[0])]
+        changed = {path for path, one in known if one != self._seen.get(path)}
+        # As an age: when somebody sets the clock, the files before the start must not look new.
+        now_ns, age_ns = time.time_ns(), time.monotonic_ns() - since.at_ns
+        others = self._seen.keys() - {path for path, _ in known}
+        late = {path for path in others if 0 <= now_ns - self._seen[path].changed_ns < age_ns}
+        return frozenset(changed | late)
 
     def take(self, paths: Iterable[str]) -> frozenset[str]:
         """Note how `paths` are now; the paths."""

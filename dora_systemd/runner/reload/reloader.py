@@ -14,7 +14,7 @@ from pathlib import PurePath
 from typing import Any
 
 from dora_systemd.adapters.dora.preparation import Prepared, resolved
-from dora_systemd.adapters.host.watch import identity
+from dora_systemd.adapters.host.watch import Since, identity
 from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -72,6 +72,7 @@ class Reloader:
         self._untold: DoraSystemdError | None = None
         self._begun_ns = 0
         self._versions = Versions()
+        self._since = Since(time.monotonic_ns(), self._versions.known)
         self._has_imports = False
         self._noting_lock = threading.Lock()
         self._tried: RunnerOptions | None = None
@@ -151,7 +152,8 @@ class Reloader:
             self._settings.keep()
         except DoraSystemdError as error:
             self._refuse(error)  # of this file only: the others can be reloaded
-        self._watcher.watch(self.options if self.options.hot_reload else None)
+        # Not only what is saved from now on: this can be late, and no start should wait for it.
+        self._watcher.watch(self.options if self.options.hot_reload else None, self._since)
         while True:
             await self._wake.wait()
             await self._begun.wait()
@@ -230,23 +232,23 @@ class Reloader:
 
     async def _follow_link(self, run: Run, moved: RunnerOptions) -> list[str]:
         """Run the dataflow that a link leads to now, all of it: its daemon knows directories."""
-        self._tried = moved
+        self._tried, since = moved, Since(time.monotonic_ns())
         taken = Versions()
         taken.take(moved.dataflow, [moved.dataflow])
         change = await asyncio.to_thread(Sources(moved, self._environment).look_elsewhere)
         run.pipes.write_event("files-changed", files=moved.dataflow)
-        self._follow(moved)
+        self._follow(moved, since)
         done = await self._apply(run, change)
         self._versions.merge(taken)
         return done
 
-    def _follow(self, moved: RunnerOptions) -> None:
-        """Use the paths of these options from now on."""
+    def _follow(self, moved: RunnerOptions, since: Since | None = None) -> None:
+        """Use the paths of these options from now on. since: as of Watcher.watch()."""
         if _place(moved) != _place(self.options):
             self.options = _at(self.options, moved)
             self._sources = Sources(self.options, self._environment)
             self._settings.path = settings_path(moved.dataflow)
-            self._watcher.watch(self.options if self.options.hot_reload else None)
+            self._watcher.watch(self.options if self.options.hot_reload else None, since)
 
     async def _take_settings(self, run: Run) -> list[str]:
         """Apply changed node limits at once; other settings wait for the next start."""

@@ -1,6 +1,6 @@
 """Remembers which versions of its files each node was started with."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 from dora_systemd.adapters.host.watch import Identity, identity
 
@@ -31,6 +31,11 @@ class Versions:
         for path, one in _identities(set(paths) - known.keys()).items():
             if one is None or not begun_ns < one.changed_ns <= now_ns:
                 known[path] = one
+
+    def known(self) -> Iterator[tuple[str, Identity | None]]:
+        """The known versions of all files. May be called in any thread."""
+        for files in list(self._known.values()):
+            yield from list(files.items())
 
     def differ(self, path: str) -> bool:
         """Whether a file of the dataflow itself is another one, or has come or gone."""

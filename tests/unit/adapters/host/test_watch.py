@@ -1,6 +1,7 @@
 """Watched files, with the real inotify."""
 
 import asyncio
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,39 @@ def test_a_save_before_the_watches_exist_is_found(
     monkeypatch.setattr(watchfiles, "awatch", late)
     found = asyncio.run(first(WatchRules(str(tmp_path), ("*.py",)), 1000))
     assert found == {str(saved), *(str(tmp_path / name) for name in others)}
+
+
+LATER, EARLIER = 5, -5
+"""Seconds from the save of the file to the start of the run."""
+KNOWN: dict[str, tuple[int, str, str, bool]] = {
+    "saved after the start": (EARLIER, "node.py", "", True),
+    "saved before it": (LATER, "node.py", "", False),
+    "the version that runs": (EARLIER, "node.py", "same", False),
+    "another one, whatever the clock says": (LATER, "node.py", "other", True),
+    "it has gone": (LATER, "gone.py", "same", True),
+    "it has come": (LATER, "node.py", "none", True),
+    "nobody watches it": (LATER, "node.txt", "other", False),
+}
+
+
+@pytest.mark.parametrize(("after", "name", "version", "is_found"), KNOWN.values(), ids=KNOWN)
+def test_a_save_between_the_start_and_the_first_look(
+    tmp_path: Path, after: int, name: str, version: str, is_found: bool
+) -> None:
+    (tmp_path / "other.py").write_text("")
+    other = watch.identity(str(tmp_path / "other.py"))
+    (tmp_path / "other.py").unlink()
+    saved = tmp_path / name
+    saved.write_text("")
+    known = {"same": watch.identity(str(saved)), "other": other, "none": None}
+    pairs = [(str(saved), known[version])] if version else []
+    if name.startswith("gone"):
+        saved.unlink()
+    began_ns = time.monotonic_ns() + after * 1_000_000_000
+    seen = watch.Seen(WatchRules(str(tmp_path), ("*.py",)))
+    found = seen.first(watch.Since(began_ns, lambda: pairs))
+    assert found == ({str(saved)} if is_found else set())
+    assert not seen.missed(), "it is reported once"
 
 
 def test_what_is_unchanged_is_not_told(tmp_path: Path) -> None:

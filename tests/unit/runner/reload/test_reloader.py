@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.dora.preparation import prepare
+from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -21,8 +22,9 @@ from tests.unit.fakes.reload import ReloadBench
 class Bench(ReloadBench):
     """A reloader of a dataflow of the nodes a and b, which runs."""
 
-    def __init__(self, root: Path, state: State = State.RUNNING) -> None:
+    def __init__(self, root: Path, state: State = State.RUNNING, is_hot: bool = False) -> None:
         super().__init__(root, state)
+        self.options = self.options._replace(reload=HotReload(is_hot))
         self.prepared = self.write("ab")
         settings = SettingsFile(str(root / "flow.systemd.yml"), root / "settings.yml")
         self.reloader = Reloader(self.options, {}, settings)
@@ -72,6 +74,31 @@ def test_a_save_while_a_reload_is_under_way_is_not_lost(tmp_path: Path) -> None:
         task.cancel()
 
     live(work)
+
+
+@pytest.mark.parametrize(("name", "reloaded"), [("a.py", ["a"]), ("any.json", ["a", "b"])])
+def test_a_save_before_the_first_look_at_the_files_is_not_lost(
+    tmp_path: Path, name: str, reloaded: list[str]
+) -> None:
+    """On a busy machine a start can be over before that."""
+
+    async def work() -> None:
+        bench, began_ns = Bench(tmp_path, is_hot=True), time.time_ns()
+        bench.begin()
+        await until(lambda: is_saved_after(began_ns, tmp_path / name))
+        task = asyncio.create_task(bench.reloader.work())
+        await until(lambda: len(bench.pipes.reasons("node-reloaded")) == len(reloaded))
+        assert sorted(bench.reloaded) == reloaded
+        task.cancel()
+        bench.reloader.close()
+
+    live(work)
+
+
+def is_saved_after(began_ns: int, path: Path) -> bool:
+    """Save the file; whether that was later: the time of a change may be that of the last tick."""
+    path.write_text("# saved")
+    return path.stat().st_ctime_ns > began_ns
 
 
 def test_two_reloads_by_hand_follow_each_other(tmp_path: Path) -> None:
