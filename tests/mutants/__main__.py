@@ -31,7 +31,7 @@ LEAST_PERCENT = 85.0
 PLACE = Path("/var/tmp")  # not below /tmp, which is another one for the mutants
 _NONE = "no mutant has this name"
 _STATS = "mutmut-stats.json"
-_IGNORED = (".*", "__pycache__", "dist", "mutants")
+_IGNORED = (".*", "__pycache__", "dist")
 # A mutant is root and may do anything: all but the copy is read-only, and /tmp and /var/tmp are its
 # own. mutmut sends a signal to the number of each process that may hang, also when another program
 # has that number, so it gets numbers of its own; this sh(1) reaps the orphans.
@@ -70,7 +70,7 @@ def prepare(tree: Path, folders: Sequence[str]) -> None:
         "only_mutate": [f"dora_systemd/{folder}/*" for folder in folders],
         "do_not_mutate": [f"dora_systemd/{path}" for path in TEXTS],
         "also_copy": also,
-        "pytest_add_cli_args": ["-p", "no:xdist"],
+        "pytest_add_cli_args": ["-p", "no:xdist", "-p", "tests.mutants.fresh"],
         "pytest_add_cli_args_test_selection": [f"tests/unit/{folder}" for folder in folders],
         "use_setproctitle": ["false"],
     }
