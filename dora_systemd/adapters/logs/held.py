@@ -12,6 +12,7 @@ and before that was noted, sends the entry twice.
 """
 
 import contextlib
+import errno
 import os
 import struct
 from pathlib import Path
@@ -34,10 +35,12 @@ class HeldLines:
         self._path = held_path(pipe)
         self._fd = -1
         self._size = self._done = self._noted = 0
-        # The file would lack some bytes, so it stays empty.
-        self._is_broken = False
-        with contextlib.suppress(OSError):
+        # The file would lack some bytes, so it stays empty until nothing waits.
+        self._is_broken = self._is_closed = False
+        try:
             self._begin(b"")
+        except OSError:
+            self._give_up()
 
     def take(self, fd: int, size: int) -> bytes:
         """Read up to `size` bytes from the pipe `fd` and keep them; b"" at the end of the file.
@@ -77,21 +80,24 @@ class HeldLines:
         rest: the unterminated line at the end of this batch; None if other batches wait.
         """
         self._done += lines
-        if rest == b"":
-            self._empty()
-        elif rest and (self._is_broken or self._size - len(rest) >= _MOST_DONE):
+        if rest is None or self._is_closed:
+            self.sent(0)
+        elif self._is_broken or (rest and self._size - len(rest) >= _MOST_DONE):
             try:
                 self._begin(rest)
             except OSError:
                 self._give_up()
-        else:
+        elif rest:
             self.sent(0)
+        else:
+            self._empty()
 
     def close(self) -> None:
         """Close the file, and leave it in place."""
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = -1  # later calls must not write to another file with this number
+        self._is_closed = True
 
     def _empty(self) -> None:
         with contextlib.suppress(OSError):
@@ -103,9 +109,14 @@ class HeldLines:
         """Replace the file atomically: after a kill there is the old or the new one."""
         path = self._path.with_suffix(f"{SUFFIX}-new")
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-        with contextlib.suppress(OSError):
-            os.pwritev(fd, [_HEAD.pack(_TO_THE_END, 0), rest], 0)
-        path.replace(self._path)
+        try:
+            # Less is written where the disk is almost full.
+            if os.pwritev(fd, [_HEAD.pack(_TO_THE_END, 0), rest], 0) < _HEAD.size + len(rest):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            path.replace(self._path)
+        except OSError:
+            os.close(fd)
+            raise
         if self._fd >= 0:
             os.close(self._fd)
         self._fd, self._size, self._is_broken = fd, len(rest), False

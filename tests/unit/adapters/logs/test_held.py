@@ -2,10 +2,14 @@
 
 import asyncio
 import os
+import resource
 import select
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -179,3 +183,53 @@ def test_no_file_for_what_is_held_loses_no_line(tmp_path: Path) -> None:
     held.close()
     os.close(reading)
     os.close(writing)
+
+
+@contextmanager
+def full_disk(size: int = 0) -> Iterator[None]:
+    """No file of this process can grow above so many bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("rest", [b"", b"half"])
+def test_a_disk_that_is_full_and_has_room_again(rest: bytes, fifo: Path) -> None:
+    """No line is lost meanwhile, and from then on a kill of the runner loses none."""
+    fd = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
+    with full_disk():
+        held = HeldLines(fifo)
+        os.write(fd, b"one\ntwo")
+        assert held.take(fd, 100) == b"one\ntwo"
+        held.add(b"\n")
+        held.sent(1)
+        held.sent_all(1, b"two")
+    os.write(fd, b"\nthree\n")
+    assert held.take(fd, 100) == b"\nthree\n"
+    assert read_held(fifo) == (b"", 0), "it lacks the begin of a line"
+    held.sent_all(2, rest)
+    os.write(fd, b"four\n")
+    assert held.take(fd, 100) == b"four\n"
+    assert read_held(fifo) == (rest + b"four\n", 0)
+    held.close()
+    held.sent_all(1, b"")
+    os.close(fd)
+    assert read_held(fifo) == (rest + b"four\n", 0), "who is killed leaves it"
+
+
+def test_a_disk_that_is_full_in_the_middle_of_a_write(fifo: Path) -> None:
+    held = HeldLines(fifo)
+    fd = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
+    with full_disk(20):
+        os.write(fd, b"long line")
+        assert held.take(fd, 100) == b"long line"[:4]
+        assert held.take(fd, 100) == b"long line"[4:]
+        held.sent_all(0, b"long line")
+        assert read_held(fifo) == (b"", 0), "rather nothing than a part of it"
+    held.sent_all(0, b"long line")
+    assert read_held(fifo) == (b"long line", 0)
+    held.close()
+    os.close(fd)
