@@ -70,9 +70,8 @@ class ExportReader:
         name, equals, value = self._data[start:end].partition(b"=")
         after = end + 1
         if not equals:
-            if len(self._data) < end + 9:
-                return None
             first = end + 9
+            # Of less than eight bytes, too: then the data ends before `first`.
             last = first + int.from_bytes(self._data[end + 1 : first], "little")
             if len(self._data) < last + 1:
                 return None

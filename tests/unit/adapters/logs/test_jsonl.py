@@ -2,7 +2,10 @@
 
 import asyncio
 import json
-from pathlib import Path
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path, PosixPath
 
 import pytest
 from hypothesis import given
@@ -10,7 +13,6 @@ from hypothesis import strategies as st
 
 from dora_systemd.adapters.logs.jsonl import JsonlTail, resume_tail
 from dora_systemd.decisions.logs.fields import Value
-from dora_systemd.decisions.logs.lines import jsonl_fields
 
 
 class Dora:
@@ -66,7 +68,8 @@ def test_many_lines(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
 
 def test_a_kill_and_who_comes_after(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
     """The place that is noted is that of what the journal has, over rotations too."""
-    dora, place = Dora(tmp_path), tmp_path / "a.place"
+    (tmp_path / "two words").mkdir()
+    dora, place = Dora(tmp_path / "two words"), tmp_path / "a.place"
     busy: list[int] = []
     found: list[str] = []
 
@@ -235,40 +238,92 @@ def test_waits_while_the_journal_is_busy(tmp_path: Path) -> None:
     asyncio.run(scenario())
 
 
-def test_fields_of_a_raw_line() -> None:
-    line = (
-        b'{"ts":"T","level":"stdout","node":"b","stream":"stderr","msg":"err",'
-        b'"target":null,"fields":null}'
-    )
-    assert jsonl_fields(line) == {
-        "PRIORITY": 5,
-        "DORA_TIMESTAMP": "T",
-        "DORA_STREAM": "stderr",
-        "MESSAGE": "err",
-    }
+class Watched(PosixPath):
+    """Lets dora do something right after it has been looked at, once."""
+
+    after: Callable[[], object] | None = None
+
+    def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
+        found = super().stat(follow_symlinks=follow_symlinks)
+        if after := self.after:
+            self.after = None
+            after()
+        return found
 
 
-def test_fields_of_a_structured_line() -> None:
-    line = (
-        b'{"ts":"T","level":"warn","node":"b","stream":"stdout","msg":"m",'
-        b'"target":"my.t","fields":{"a":"1"}}'
-    )
-    assert jsonl_fields(line) == {
-        "PRIORITY": 4,
-        "DORA_LEVEL": "warn",
-        "DORA_TIMESTAMP": "T",
-        "DORA_TARGET": "my.t",
-        "DORA_FIELD_A": "1",
-        "DORA_STREAM": "stdout",
-        "MESSAGE": "m",
-    }
+def test_what_dora_writes_just_before_it_rotates_the_file(
+    loop: asyncio.AbstractEventLoop, tmp_path: Path
+) -> None:
+    """After the read that has found nothing more, and before the file has its other name."""
+    dora, found = Dora(tmp_path), list[str]()
+    watched = Watched(dora.path)
+    follower = JsonlTail(loop, watched, lambda fields: found.append(str(fields["MESSAGE"])))
+    dora.write(2)
+    follower.drain()
+
+    def write_and_rotate() -> None:
+        dora.write(2)
+        dora.rotate(keep=2)
+        dora.write(2)
+
+    watched.after = write_and_rotate
+    assert follower.drain() is False, "it looks at the files, and has nothing to read"
+    watched.after = None
+    follower.drain()
+    follower.close()
+    assert (found, follower.lost_files) == (numbers(6), 0)
 
 
-def test_line_that_dora_cut() -> None:
-    line = b'{"ts":"T","level":"stdout","stream":"stdout","msg":"xx... [truncated]"}'
-    assert jsonl_fields(line)["DORA_CUT"] == 1
+def test_a_file_that_is_gone_when_it_is_opened(
+    loop: asyncio.AbstractEventLoop, tmp_path: Path
+) -> None:
+    dora = Dora(tmp_path)
+    dora.write(2)
+    watched = Watched(dora.path)
+    watched.after = dora.path.unlink
+    found: list[object] = []
+    follower = JsonlTail(loop, watched, found.append)
+    follower.resume(dora.path.stat().st_ino, 1)
+    assert (follower.backlog(), found) == (0, [])
+    dora.write(1)
+    follower.close()
+    assert len(found) == 1
 
 
-@pytest.mark.parametrize("line", [b"", b"{", b"[]", b"{}", b'{"stream":1,"level":2}', b"\xff"])
-def test_broken_line_is_kept_as_it_is(line: bytes) -> None:
-    assert jsonl_fields(line) == {"PRIORITY": 6, "MESSAGE": line}
+def test_the_last_line_need_not_end(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    """As where the machine has lost its power."""
+    dora = Dora(tmp_path)
+    dora.path.write_text('{"ts": "t", "level": "stdout", "stream": "stdout", "msg": "half"}')
+    follower, found = tail(loop, dora)
+    follower.drain()
+    assert found == []
+    follower.close()
+    assert found == ["half"]
+
+
+def test_only_its_user_reads_the_place(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    place = tmp_path / "a.place"
+    before = os.umask(0)
+    try:
+        follower = JsonlTail(loop, tmp_path / "log_a.jsonl", print, place=place)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(place.stat().st_mode) == 0o600
+    follower.close()
+
+
+def test_to_close_it_twice_closes_nothing_else(
+    loop: asyncio.AbstractEventLoop, tmp_path: Path
+) -> None:
+    dora = Dora(tmp_path)
+    dora.write(1)
+    follower = JsonlTail(loop, dora.path, lambda _: None, place=tmp_path / "a.place")
+    follower.start()
+    follower.close()
+    reading, writing = os.pipe()  # these have the numbers that were closed
+    follower.close()
+    os.write(writing, b"x")
+    assert os.read(reading, 1) == b"x"
+    os.fstat(1)
+    for fd in (reading, writing):
+        os.close(fd)

@@ -119,3 +119,16 @@ def test_the_pipes_of_a_node(tmp_path: Path) -> None:
         "stdout": paths.node_stdout("a"),
         "stderr": paths.node_stderr("a"),
     }
+
+
+def open_files() -> int:
+    return len([*Path("/dev/fd").iterdir()])
+
+
+def test_to_close_a_pipe_closes_what_it_holds(fifo: Path) -> None:
+    """Or each restart of a node would leave open files, until none can be opened."""
+    before = open_files()
+    for held in (HeldLines(fifo), None):
+        fd = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
+        Pipe(fd, "stdout", LineEncoder(ORIGIN, "stdout"), held=held).close()
+    assert open_files() == before

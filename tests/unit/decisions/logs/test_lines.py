@@ -252,3 +252,42 @@ def test_no_depth_of_nesting_is_an_error(key: str) -> None:
         line += b'"%s":%s}' % (key.encode(), value)
         assert encoder.entry(line)
         assert jsonl_fields(line)["MESSAGE"]
+
+
+def test_fields_of_a_raw_line() -> None:
+    line = (
+        b'{"ts":"T","level":"stdout","node":"b","stream":"stderr","msg":"err",'
+        b'"target":null,"fields":null}'
+    )
+    assert jsonl_fields(line) == {
+        "PRIORITY": 5,
+        "DORA_TIMESTAMP": "T",
+        "DORA_STREAM": "stderr",
+        "MESSAGE": "err",
+    }
+
+
+def test_fields_of_a_structured_line() -> None:
+    line = (
+        b'{"ts":"T","level":"warn","node":"b","stream":"stdout","msg":"m",'
+        b'"target":"my.t","fields":{"a":"1"}}'
+    )
+    assert jsonl_fields(line) == {
+        "PRIORITY": 4,
+        "DORA_LEVEL": "warn",
+        "DORA_TIMESTAMP": "T",
+        "DORA_TARGET": "my.t",
+        "DORA_FIELD_A": "1",
+        "DORA_STREAM": "stdout",
+        "MESSAGE": "m",
+    }
+
+
+def test_line_that_dora_cut() -> None:
+    line = b'{"ts":"T","level":"stdout","stream":"stdout","msg":"xx... [truncated]"}'
+    assert jsonl_fields(line)["DORA_CUT"] == 1
+
+
+@pytest.mark.parametrize("line", [b"", b"{", b"[]", b"{}", b'{"stream":1,"level":2}', b"\xff"])
+def test_broken_line_is_kept_as_it_is(line: bytes) -> None:
+    assert jsonl_fields(line) == {"PRIORITY": 6, "MESSAGE": line}

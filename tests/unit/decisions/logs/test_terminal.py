@@ -44,6 +44,15 @@ def test_second_line_of_a_message_stays_below_the_first() -> None:
     assert found[1].index(b"two") == found[0].index(b"one") + 2
 
 
+def test_second_line_below_a_coloured_first_one() -> None:
+    """journalctl prints the name of a failed node in bold, and indents by what is visible."""
+    first = b"Nov 21 01:02:59 lab \x1b[0;1;39mrobot/camera[95]\x1b[0m: one\n"
+    data = first + b" " * (len(plain(first)) - len(b"one\n")) + b"  two\n"
+    found = plain(fed(TerminalLines(["detector"]), data)).splitlines()
+    assert found[0] == b"Nov 21 01:02:59 camera   one"
+    assert found[1] == b" " * len(b"Nov 21 01:02:59 camera   ") + b"  two"
+
+
 def test_chunks_make_no_difference() -> None:
     data = (SHORT + b"one\n" + SHORT + b"two\n") * 3 + (SHORT + b"one\n") * 5
     data += SHORT + b"one\n" + b" " * len(SHORT) + b"more\n"
@@ -145,3 +154,11 @@ def test_what_an_event_says_is_said_once() -> None:
     assert texts(data, has_events=True) == ["00 camera Node camera crashed: exit code 1"]
     assert len(texts(data)) == 2
     assert len(texts(line("camera", crash) + line("daemon", "other"), has_events=True)) == 2
+
+
+def test_a_line_of_other_bytes_that_comes_again() -> None:
+    """Which is no text, as of a node that writes Latin-1, in a name and in a message."""
+    again = SHORT.replace(b"camera", b"k\xfcche") + b"gr\xfc\xdf\n"
+    found = plain(fed(TerminalLines(), again * 3)).splitlines()
+    assert len(found) == 2
+    assert found[1] == rb"Nov 21 01:02:59 k\xfcche ... 3 times"
