@@ -201,7 +201,6 @@ def _check(plan: Plan, dataflow: Dataflow, root: str, want_build: bool) -> None:
         reason = "it runs on several machines"
         raise _refusal(reason, "bring the files to each of them, and use doractl start")
     for node in dataflow.nodes:
-        reason = hint = ""
         if node.git and not want_build:
             reason, hint = "its program comes from git", "deploy without --no-build"
         elif node.path.startswith(f"{root}/"):

@@ -69,6 +69,9 @@ def test_before_the_commit(
     assert [one.is_proved for one in store.known()] == [False]
     assert now(manager, scope).current == OLD
     assert ("RestartUnit", UNIT) in manager.calls
+    (switch,) = store.history()
+    assert (switch.former, switch.release, switch.how) == (NEW, OLD, "interrupted")
+    assert switch.reason == "the command that tried it was killed", "which is no fault of it"
 
 
 def test_before_systemd_was_told(

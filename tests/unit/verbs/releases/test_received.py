@@ -79,6 +79,7 @@ def test_what_is_sent_is_deployed(sender: Sender) -> None:
     manifest = sender.store.manifest(done.release)
     facts = (manifest.source, manifest.revision, manifest.dataflow, done.files, done.copied)
     assert facts == ("/home/ann/robot", REVISION, "dataflow.yml", 3, 43)
+    assert sender.texts[:2] == ["copying: 0B of 36B", "copying: 29B of 36B"]
     tree = sender.store.tree(done.release)
     assert {path: (tree / path).read_text() for path in FILES} == FILES
     assert sender.releases == {done.release: "current"}

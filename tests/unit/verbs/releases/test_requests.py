@@ -8,16 +8,17 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.releases.draft import Draft
-from dora_systemd.adapters.releases.store import Store
+from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.past import REPLACED, Switch
 from dora_systemd.decisions.views.findings import State
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.forget import find_kept, forget, remove_releases
-from dora_systemd.verbs.releases.listing import judge_releases, read_history
+from dora_systemd.verbs.releases.listing import judge_releases, read_history, read_releases
 from dora_systemd.verbs.releases.rollback import deployed_name, roll_back
 from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.releases.trial import read_standing
@@ -184,6 +185,29 @@ def test_what_a_rollback_refuses(manager: FakeManager, scope: Scope, releases: S
     assert error.code is ExitCode.BAD_INPUT
 
 
+def test_a_change_that_a_power_cut_has_kept_from_being_written(
+    manager: FakeManager, scope: Scope, releases: Store
+) -> None:
+    deployed(manager)
+    with locked(releases):
+        releases.record(Switch(5, "", NEW, REPLACED))
+    last, first = read_history(manager, scope, "robot")
+    assert (last.former, last.release, first.release) == (NEW, OLD, NEW)
+
+
+def test_the_state_of_a_release_that_nobody_can_read(
+    manager: FakeManager, scope: Scope, releases: Store
+) -> None:
+    deployed(manager)
+    releases.doubt(NEW)
+    for release, state in ((OLD, "current"), (NEW, "unproved")):
+        rows = {row.id: row.state for row in read_releases(manager, scope, ["robot"])}
+        assert rows[release] == state
+        (releases.release(release) / "release.json").unlink()
+    rows = {row.id: row.state for row in read_releases(manager, scope, ["robot"])}
+    assert rows == {OLD: "current", NEW: "unknown"}
+
+
 def test_a_damaged_release(manager: FakeManager, scope: Scope, releases: Store) -> None:
     manager.add(release_options(OLD), Transient=False)
     gone = {name: Stored(1, False, "0" * 64) for name in ("b", "a", "c")}
@@ -271,6 +295,14 @@ PROJECTS: dict[str, tuple[str, dict[str, Any], str]] = {
     "node a: its path ROOT/a.py would be outside of the release": (
         *(NODE % "ROOT/a.py", {}, "write it relative to ROOT"),
     ),
+    "uv is on, and would write to the release": (
+        *(NODE % "a.py", {"uv": True}),
+        "deploy with --no-uv: then uv makes .venv from uv.lock, also for build: pip install",
+    ),
+    "node a: its path ../x.py leads out of ROOT": (
+        *(NODE % "../x.py", {}),
+        "use --working-directory ABOVE, and write the path from there: x.py",
+    ),
     "its working directory / is not in the project": (
         *(NODE % "a.py", {"working_directory": "/"}),
         "give a directory below the file, or above it, with --working-directory",
@@ -285,9 +317,11 @@ def test_projects_that_cannot_be_deployed(tmp_path: Path, reason: str) -> None:
     root.mkdir()
     (root / "a.py").touch()
     (root / "dataflow.yml").write_text(text.replace("ROOT", str(root)))
+    (tmp_path / "x.py").touch()
+    make_program(tmp_path / "bin/uv")
     given = {"dora": make_program(tmp_path / "bin/dora"), **flags}
-    request = StartRequest(str(root), flags=given)
+    request = StartRequest(str(root), None, given, {"PATH": str(tmp_path / "bin")})
     error = refusal(lambda: find_source(USER, request))
     assert error.message == f"cannot deploy: {reason.replace('ROOT', str(root))}"
-    assert error.hint == hint.replace("ROOT", str(root))
+    assert error.hint == hint.replace("ROOT", str(root)).replace("ABOVE", str(tmp_path))
     assert error.code is ExitCode.BAD_INPUT

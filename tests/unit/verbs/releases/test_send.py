@@ -30,13 +30,16 @@ def project(tmp_path: Path) -> Path:
     return root
 
 
-def pack(project: Path, meanwhile: Callable[[], object] = bool) -> dict[str, Any]:
+def pack(
+    project: Path, meanwhile: Callable[[], object] = bool, is_reader_root: bool = False
+) -> dict[str, Any]:
     """Pack it. meanwhile: happens when the settings are checked, and not packed yet."""
     request = StartRequest(str(project / "robot.yml"))
 
-    def find_reader(_sender: object) -> Account:
+    def find_reader(_sender: object) -> Account | None:
         meanwhile()
-        return own_account()  # the other user cannot reach the directory
+        # The other user cannot reach the directory.
+        return None if is_reader_root else own_account()
 
     with send.packed(request, lambda _: None, lambda _: None, find_reader) as found:
         return dict(found.parcel.files)
@@ -93,3 +96,29 @@ def test_files_that_only_root_could_read_over_there(project: Path, file: str) ->
     (project / "own.env").write_text("A=1\n")
     beside.write_text("env_file: own.env\n")
     assert "own.env" in pack(project)
+
+
+def test_what_root_does_not_read_where_no_other_user_can(project: Path) -> None:
+    """Whoever can replace a file could have root send any file of this machine."""
+    for path in (project, *project.iterdir()):
+        os.chown(path, 0, 0)
+    assert pack(project, is_reader_root=True).keys() >= {"robot.yml"}
+    (project / "lib").mkdir()
+    (project / "lib/b.py").touch()
+    os.chown(project / "lib", 1, 1)
+    with pytest.raises(DoraSystemdError) as caught:
+        pack(project, is_reader_root=True)
+    error = caught.value
+    assert error.message == f"cannot read {project}/lib as root: others can change it"
+    assert error.hint == "let its owner deploy it, or make the user dora, who reads it"
+    assert error.code is ExitCode.BAD_INPUT
+
+
+def test_a_path_of_this_machine_is_not_sent(project: Path) -> None:
+    (project / "robot.yml").write_text(FLOW.replace("a.py", f"{project}/a.py"))
+    with pytest.raises(DoraSystemdError) as caught:
+        pack(project)
+    error = caught.value
+    path = f"{project}/a.py"
+    assert error.message == f"cannot send node a: its path {path} is of this machine"
+    assert (error.hint, error.code) == (f"write it relative to {project}", ExitCode.BAD_INPUT)

@@ -248,11 +248,27 @@ def test_what_is_told_until_it_is_ready(scope: Scope, clock: list[float]) -> Non
     assert clock[0] == pytest.approx(1000.8)
 
 
+def test_what_ran_before_may_still_write_about_its_end(
+    manager: FakeManager, scope: Scope, clock: list[float], journal: FakeJournal
+) -> None:
+    """A node that crashes when its dataflow is stopped is no fault of the next release."""
+    assert clock
+    unit = manager.add(options(), InvocationID=b"\x01")
+    gate = Gate(manager, scope, options(), lambda _: None)
+    journal.write({**crash(1001), "_SYSTEMD_INVOCATION_ID": "01"})
+    assert gate._soak(0) is None
+    manager.units[unit] |= {"ActiveState": "inactive", "InvocationID": b"\x02"}
+    assert gate._wait_ready(SECOND) == STOPPED
+    journal.write(crash(1001))
+    assert gate._wait_ready(SECOND) == CRASHED
+
+
 def test_nodes_that_are_not_ready_in_time(
-    manager: FakeManager, scope: Scope, clock: list[float]
+    manager: FakeManager, scope: Scope, clock: list[float], journal: FakeJournal
 ) -> None:
     manager.add(options(), "activating", InvocationID=b"", StatusText="0/3 nodes ready")
     gate = Gate(manager, scope, options(), lambda _: None)
     late = Fault("not all nodes are ready after 3s")
     assert gate._wait_ready(3 * SECOND) == late
     assert clock[0] == pytest.approx(1003.1, abs=0.2)
+    assert 4 <= len(journal.asked) <= 5, "it looks once in a second, and at the end"

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.releases.source import Source, find_source, require_same
+from dora_systemd.verbs.releases.source import Source, find_source, named_paths, require_same
 from dora_systemd.verbs.start.plan import StartRequest
 from tests.unit.fakes.programs import make_program
 
@@ -78,3 +79,23 @@ def test_nothing_makes_the_programs_of_a_clone_without_uv(tmp_path: Path) -> Non
     with pytest.raises(DoraSystemdError, match=r"'robot-camera' is neither in") as caught:
         clone_of(tmp_path)
     assert f"run `uv sync` in {tmp_path}/clone first" in str(caught.value.hint)
+
+
+def test_what_a_dataflow_names_belongs_to_its_release() -> None:
+    """Also what git does not track, and .gitignore leaves out."""
+    nodes = [
+        {"id": "a", "path": "a.py"},
+        {"id": "b", "path": "../b.py"},
+        {"id": "c", "path": "/usr/bin/c"},
+        {"id": "d", "path": "https://host/d"},
+        {"id": "e", "module": "e.yml"},
+        {"id": "f", "operator": {"python": "f.py"}},
+        {"id": "g", "operators": [{"id": "x", "python": {"source": "g.py"}}, {"id": "y"}]},
+        {"id": "h", "path": "a.py"},
+    ]
+    dataflow = parse_dataflow({"nodes": nodes}, "/r/flows/x.yml")
+    found = named_paths(dataflow, "/r/work", "/r", ("/r/x.env", "/other/y.env", "/r2/z.env"))
+    assert found == (
+        *("flows/x.yml", "flows/x.systemd.yml", "work/a.py", "b.py"),
+        *("work/e.yml", "work/f.py", "work/g.py", "x.env"),
+    )
