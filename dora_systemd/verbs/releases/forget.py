@@ -76,6 +76,9 @@ def remove_releases(
     """
     name = _name(manager, scope, selector)
     store = store_of(scope, name)
+    if not is_directory(store.path):
+        hint = f"doractl deploy --name {name} makes the first one"
+        raise DoraSystemdError(f"{name} has no release", hint, ExitCode.NOT_FOUND)
     with locked(store, make=False):
         standing = read_standing(manager, scope, unit_name(name))
         known = tuple(one.id for one in store.known())

@@ -12,13 +12,18 @@ from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import REPLACED, Switch
-from dora_systemd.decisions.views.findings import State
+from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.forget import find_kept, forget, remove_releases
-from dora_systemd.verbs.releases.listing import judge_releases, read_history, read_releases
+from dora_systemd.verbs.releases.listing import (
+    judge_releases,
+    read_history,
+    read_releases,
+    store_of,
+)
 from dora_systemd.verbs.releases.rollback import deployed_name, roll_back
 from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.releases.trial import read_standing
@@ -32,6 +37,7 @@ from tests.unit.verbs.releases.test_trial import (
     OLD,
     UNIT,
     deployed,
+    etc,
     release_options,
     store,
     text_of,
@@ -164,6 +170,7 @@ def test_the_end_of_a_first_trial_that_was_killed(
     assert done == Deployed(UUID, "robot", UNIT, "", NEW, 0, 0, 0)
     killed = "the command that tried it was killed"
     assert notes.found(*FACTS) == [STOPPED, ("release-rolled-back", NEW, "", "", killed)]
+    assert {one["DORA_BY"].partition(" ")[2] for one in notes.records} == {"(doractl rollback)"}
 
 
 def test_what_a_rollback_refuses(manager: FakeManager, scope: Scope, releases: Store) -> None:
@@ -206,6 +213,46 @@ def test_the_state_of_a_release_that_nobody_can_read(
         (releases.release(release) / "release.json").unlink()
     rows = {row.id: row.state for row in read_releases(manager, scope, ["robot"])}
     assert rows == {OLD: "current", NEW: "unknown"}
+
+
+def test_a_unit_of_somebody_else_hides_no_finding(
+    manager: FakeManager, scope: Scope, releases: Store
+) -> None:
+    other = Store(releases.path.parent, "other")
+    with locked(other):
+        other.release(OLD).mkdir()
+    (releases.path / ".new-0a1b2c3d4e5f").mkdir()
+    etc(manager).parent.mkdir(parents=True)
+    foreign = etc(manager).with_name("dora-other.service")
+    foreign.write_text("[Service]\nExecStart=/bin/true\n")
+    error = refusal(lambda: read_standing(manager, scope, foreign.name))
+    first, second = judge_releases(manager, scope)
+    assert first == Finding("releases", State.WARNING, error.message, error.hint)
+    assert second.text.startswith(str(releases.path))
+    rows = read_releases(manager, scope, ["other", "robot"])
+    assert {(row.name, row.state) for row in rows} == {("other", "unknown"), ("robot", "proved")}
+    assert refusal(lambda: read_releases(manager, scope, ["other"])).message == error.message
+
+
+def test_what_a_deploy_that_runs_has_made_is_no_rest(
+    manager: FakeManager, scope: Scope, releases: Store
+) -> None:
+    (releases.path / ".new-0a1b2c3d4e5f").mkdir()
+    with locked(releases):
+        assert list(judge_releases(manager, scope)) == []
+    assert len(list(judge_releases(manager, scope))) == 1
+
+
+def test_nothing_is_made_of_a_dataflow_without_releases(manager: FakeManager, scope: Scope) -> None:
+    manager.add(release_options(OLD))
+    acts: tuple[Callable[[], object], ...] = (
+        lambda: list(remove_releases(manager, scope, "robot", (OLD,))),
+        lambda: roll_back(manager, scope, "robot", OLD, 0, print),
+    )
+    for error in map(refusal, acts):
+        assert (error.message, error.code) == ("robot has no release", ExitCode.NOT_FOUND)
+        assert error.hint == "doractl deploy --name robot makes the first one"
+    assert not store_of(scope, "robot").path.exists()
 
 
 def test_a_damaged_release(manager: FakeManager, scope: Scope, releases: Store) -> None:
