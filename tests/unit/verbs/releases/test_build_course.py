@@ -38,6 +38,7 @@ class Builder(Systemd):
         self.looks: list[dict[str, Any]] = [DONE]
         self.work: Callable[[Path], object] = bool
         self.sent: dict[str, Any] = {}
+        self.kinds: dict[str, str] = {}
         self.seen = 0
 
     def start_transient(
@@ -52,6 +53,7 @@ class Builder(Systemd):
             return super().start_transient(unit, properties, observer, wait, beside)
         self.calls.append(("start", unit, wait))
         self.sent = {name: value for name, _, value in properties}
+        self.kinds = {name: kind for name, kind, _ in properties}
         self.units[unit] = {**BEGUN}
         self.work(Path(self.sent["BindPaths"][-1][0]))
         return ""
@@ -123,6 +125,32 @@ def test_what_is_built_belongs_to_the_release(bench: BuildBench) -> None:
     assert bench.texts[:2] == ["copying: 0B of 42B", "copying: 42B of 42B"]
 
 
+def test_a_virtual_environment_that_the_build_makes(bench: BuildBench) -> None:
+    def work(tree: Path) -> None:
+        (tree / ".venv/bin").mkdir(parents=True)
+        (tree / ".venv/pyvenv.cfg").touch()
+        (tree / ".venv/bin/python").symlink_to("/usr/bin/python3")
+        place = bench.systemd.sent["BindPaths"][-1][1]
+        (tree / ".venv/bin/a").symlink_to(f"{place}/a.py")
+        (tree / "top").symlink_to(f"{place}/a.py")
+
+    bench.systemd.work = work
+    done = bench.build()
+    venv = f"{bench.store.tree(done.release)}/.venv"
+    assert f" --venv={venv} " in bench.store.unit(done.release)
+    own = {f"VIRTUAL_ENV={venv}", f"UV_PROJECT_ENVIRONMENT={venv}"}
+    variables = bench.systemd.sent["Environment"]
+    assert own <= {*variables}
+    assert [one for one in variables if one.startswith(f"PATH={venv}/bin:")]
+    files = bench.store.manifest(done.release).files
+    links = {path: one.target for path, one in files.items() if one.target}
+    inside = f"{bench.store.tree(done.release)}/a.py"
+    assert links == {
+        **{".venv/bin/a": inside, ".venv/bin/python": "/usr/bin/python3", "top": inside}
+    }
+    assert bench.warnings == [], "no other release shares it"
+
+
 def test_its_unit(bench: BuildBench) -> None:
     done = bench.build()
     sent, tree = bench.systemd.sent, bench.store.tree(done.release)
@@ -133,6 +161,8 @@ def test_its_unit(bench: BuildBench) -> None:
     assert f'"directory": "{tree}"' in words[-1]
     command = f'"commands": [["{bench.dora}", "build", "--local", "{tree}/dataflow.yml"], ["/bin'
     assert command in words[-1]
+    kinds = {"Description": "s", "KillSignal": "i", "CollectMode": "s", "AddRef": "b"}
+    assert kinds.items() <= bench.systemd.kinds.items(), "systemd takes no other types"
     assert {
         name: sent[name] for name in ("Description", "KillSignal", "CollectMode", "AddRef")
     } == {

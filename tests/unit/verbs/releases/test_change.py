@@ -214,6 +214,26 @@ def test_it_waits_for_the_end_of_a_lock(bench: Bench, verb: str, act: Act) -> No
     assert bench.releases[done.release] == "current"
 
 
+@pytest.mark.parametrize("how", [IfInhibited.REFUSE, IfInhibited.WAIT])
+def test_a_lock_of_a_first_trial_that_was_killed(bench: Bench, how: IfInhibited) -> None:
+    """It may have begun to drive."""
+    trial = bench.manager.paths[0]
+    trial.parent.mkdir(parents=True, exist_ok=True)
+    bench.manager.paths[1].rename(trial)
+    bench.manager.units[UNIT] |= {"FragmentPath": str(trial)}
+    with locked_cell(bench) as release:
+        bench.steps = Told(lambda text: release() if "waiting for its end" in text else None)
+        if how is IfInhibited.WAIT:
+            assert roll_it_back(bench, how).release == ""
+            assert bench.texts[0].startswith("cannot rollback robot: inhibited by ")
+            assert ("StopUnit", UNIT) in bench.manager.calls
+            return
+        with pytest.raises(DoraSystemdError) as caught:
+            roll_it_back(bench, how)
+    assert caught.value.message.startswith("cannot rollback robot: inhibited by ")
+    assert bench.manager.calls == []
+
+
 def test_what_is_disabled_and_stopped_runs_again_by_its_id(bench: Bench) -> None:
     """systemd knows nothing of it, and no unit file says what ran."""
     first, _ = bench.releases

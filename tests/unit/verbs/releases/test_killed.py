@@ -98,11 +98,16 @@ def test_while_systemd_was_told(
     assert ("RestartUnit", UNIT) in manager.calls
 
 
-def test_after_the_commit(manager: FakeManager, scope: Scope, end: "partial[None]") -> None:
+def test_after_the_commit(
+    manager: FakeManager, scope: Scope, store: Store, end: "partial[None]"
+) -> None:
     """Nothing is started again, and the link is there that it had not made yet."""
     manager.disable_unit_files([UNIT])
     etc(manager).write_text(text_of(NEW))
     end()
     standing = now(manager, scope)
     assert (standing.current, standing.boot.is_enabled) == (NEW, True)
+    (switch,) = store.history()
+    assert (switch.former, switch.release, switch.how) == (OLD, NEW, "replaced")
+    assert switch.by.endswith(" (doractl deploy)")
     assert "RestartUnit" not in [call[0] for call in manager.calls]

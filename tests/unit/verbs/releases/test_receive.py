@@ -4,6 +4,8 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -14,10 +16,10 @@ from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.parcel import Parcel, format_parcel
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import receive
-from dora_systemd.verbs.releases.receive import Known, _fill
+from dora_systemd.verbs.releases.receive import Known, _fill, _renamed, _require_user
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.verbs.releases.test_trial import NEW as NEW_ID
 from tests.unit.verbs.releases.test_trial import store
@@ -155,3 +157,46 @@ def test_what_a_killed_one_has_left(tmp_path: Path) -> None:
         with incoming(tmp_path):
             assert not left.tree.exists()
             assert other.tree.exists()
+
+
+ROOTS, USERS = Scope(is_user=False, uid=0), Scope(is_user=True, uid=1000)
+
+
+@pytest.mark.parametrize(
+    ("scope", "owner", "user", "is_given", "is_refused"),
+    [
+        (ROOTS, "ann", "dora", False, True),
+        (ROOTS, "ann", "dora", True, False),
+        (ROOTS, "", "dora", False, False),
+        (ROOTS, "ann", "", False, False),
+        (USERS, "ann", "dora", False, False),
+    ],
+)
+def test_whose_code_runs_as_the_user_of_all(
+    scope: Scope, owner: str, user: str, is_given: bool, is_refused: bool
+) -> None:
+    """A project of another user that root sends: only if root names a user for it."""
+    plan = SimpleNamespace(
+        user=SimpleNamespace(pw_name=user) if user else None,
+        settings=SimpleNamespace(is_given=lambda _: is_given),
+    )
+    source: Any = SimpleNamespace(plan=plan)
+    parcel = replace(PARCEL, owner=owner)
+    if not is_refused:
+        _require_user(scope, parcel, source)
+        return
+    with pytest.raises(DoraSystemdError) as caught:
+        _require_user(scope, parcel, source)
+    error = caught.value
+    assert error.message == (
+        "cannot deploy robot: ann owns it where it comes from, "
+        "and here it would run as dora, like root's dataflows"
+    )
+    assert error.hint == "name the user here that it is to run as: --uid USER, such as --uid dora"
+    assert error.code is ExitCode.NO_PERMISSION
+
+
+def test_warnings_name_the_project_as_its_sender_does() -> None:
+    heard: list[str] = []
+    _renamed(heard.append, "/var/x/.sent/1", "/home/ann/robot")("cannot read /var/x/.sent/1/a.py")
+    assert heard == ["cannot read /home/ann/robot/a.py"]

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.releases.parcel import Parcel
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import Account, own_account
 from dora_systemd.verbs.releases import send
@@ -34,15 +35,30 @@ def pack(
     project: Path, meanwhile: Callable[[], object] = bool, is_reader_root: bool = False
 ) -> dict[str, Any]:
     """Pack it. meanwhile: happens when the settings are checked, and not packed yet."""
-    request = StartRequest(str(project / "robot.yml"))
+    return dict(pack_whole(project, meanwhile, is_reader_root).files)
 
-    def find_reader(_sender: object) -> Account | None:
+
+def pack_whole(
+    project: Path,
+    meanwhile: Callable[[], object] = bool,
+    is_reader_root: bool = False,
+    told: list[str] | None = None,
+    senders: list[send.Sender] | None = None,
+    **flags: object,
+) -> Parcel:
+    """As pack(). told: gets stages and warnings. senders: what a reader is found for."""
+    request = StartRequest(str(project / "robot.yml"), flags=flags)
+    tell = ([] if told is None else told).append
+
+    def find_reader(sender: send.Sender) -> Account | None:
         meanwhile()
+        if senders is not None:
+            senders.append(sender)
         # The other user cannot reach the directory.
         return None if is_reader_root else own_account()
 
-    with send.packed(request, lambda _: None, lambda _: None, find_reader) as found:
-        return dict(found.parcel.files)
+    with send.packed(request, tell, tell, find_reader) as found:
+        return found.parcel
 
 
 def test_a_project_of_another_user(project: Path) -> None:
@@ -68,7 +84,7 @@ def test_settings_that_change_after_the_check(project: Path, first: str | None) 
         beside.unlink()
     with pytest.raises(DoraSystemdError, match="changed while it was packed") as caught:
         pack(project, lambda: beside.write_text(IMMODEST))
-    assert caught.value.code is ExitCode.BAD_INPUT
+    assert (caught.value.hint, caught.value.code) == ("deploy again", ExitCode.BAD_INPUT)
 
 
 def test_settings_that_are_hidden_after_the_check(project: Path) -> None:
@@ -122,3 +138,40 @@ def test_a_path_of_this_machine_is_not_sent(project: Path) -> None:
     path = f"{project}/a.py"
     assert error.message == f"cannot send node a: its path {path} is of this machine"
     assert (error.hint, error.code) == (f"write it relative to {project}", ExitCode.BAD_INPUT)
+
+
+def test_what_a_parcel_says(project: Path) -> None:
+    """The other host knows nothing else of the project."""
+    told: list[str] = []
+    parcel = pack_whole(project, told=told)
+    facts = ("robot", str(project), "robot.yml", None, "")
+    assert parcel == Parcel(*facts, parcel.files, owner="daemon")
+    size = sum(one.size for one in parcel.files.values())
+    assert told[0] == f"packing: 0B of {size}B"
+    assert told[-1] == f"packing: {size}B of {size}B"
+    for path in (project, *project.iterdir()):
+        os.chown(path, 0, 0)
+    above = pack_whole(project, working_directory=str(project))
+    assert (above.directory, above.owner) == (".", "")
+
+
+def test_a_virtual_environment_stays_where_it_is(project: Path) -> None:
+    (project / ".venv/bin").mkdir(parents=True)
+    (project / ".venv/bin/python").symlink_to("/usr/bin/python3")
+    told: list[str] = []
+    pack_whole(project, told=told)
+    assert told[0] == (
+        f"{project}/.venv stays here: name a virtual environment of the hosts with --venv"
+    )
+    told.clear()
+    pack_whole(project, told=told, venv="/opt/venv")
+    assert all(one.startswith("packing: ") for one in told)
+
+
+def test_who_reads_a_project(project: Path) -> None:
+    """Its owner, so that root need not: git runs what a repository of that user says."""
+    senders: list[send.Sender] = []
+    pack_whole(project, senders=senders)
+    reader = send._reader(senders[0])
+    assert reader is not None
+    assert (reader.uid, send._owners(reader), send._owners(None)) == (1, [0, 1], [])

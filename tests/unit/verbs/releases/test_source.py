@@ -99,3 +99,19 @@ def test_what_a_dataflow_names_belongs_to_its_release() -> None:
         *("flows/x.yml", "flows/x.systemd.yml", "work/a.py", "b.py"),
         *("work/e.yml", "work/f.py", "work/g.py", "x.env"),
     )
+
+
+@pytest.mark.parametrize(
+    ("module", "is_built"),
+    [
+        ("nodes: [{id: a, path: a.py, build: make}]\n", True),
+        ("nodes: [{id: a, path: a.py}]\n", False),
+        ("nodes: {", False),
+    ],
+)
+def test_a_build_that_only_a_module_asks_for(tmp_path: Path, module: str, is_built: bool) -> None:
+    (tmp_path / FLOW).write_text("nodes: [{id: m, module: m.yml}, {id: b, path: a.py}]\n")
+    (tmp_path / "m.yml").write_text(module)
+    source = source_of(tmp_path)
+    assert bool(source.dora) is is_built
+    assert (source.uv, source.is_moving) == ("", is_built)
