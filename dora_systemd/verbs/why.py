@@ -92,7 +92,7 @@ def newest_failure(manager: Manager, scope: Scope) -> str:
     """
     rows = read_rows(manager, scope)
     ended = newest_ended(manager, scope, rows, None)
-    degraded = sorted((row for row in rows if row.status == DEGRADED), key=lambda row: -row.started)
+    degraded = sorted((row for row in rows if row.status == DEGRADED), key=lambda row: -row.ready)
     failed = [*degraded, *(row for row in ended if row.status == FAILED)]
     if not failed:
         names = ", ".join(row.name for row in rows)

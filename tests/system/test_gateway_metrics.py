@@ -29,7 +29,7 @@ def test_a_dataflow(front: Front, cell: Cell, project: Project) -> None:
     name = cell.name
     assert first["dora_dataflow_state", name, "running"] == 1
     assert first["dora_dataflow_nodes_alive", name] == 3
-    assert abs(first["dora_dataflow_start_time_seconds", name] - time.time()) < 60
+    assert abs(first["dora_dataflow_ready_time_seconds", name] - time.time()) < 60
     assert first["dora_node_state", name, "source", "running"] == 1
     assert first["dora_node_memory_bytes", name, "sink"] > 1 << 20
 

@@ -35,13 +35,15 @@ def test_one_dataflow_everywhere(cell: Cell, project: Project) -> None:
     why = found(cell, "why", cell.name)
     assert one["schema"] == listed["schema"] == look["schema"] == why["schema"] == 1
     (top,) = look["dataflows"]
-    assert settled(one) == settled(listed) == settled(top)
+    own = {key: one[key] for key in ("started", "started_us")}
+    assert settled(one) == settled(listed) == settled({**top, **own})
+    assert one["started_us"] < one["ready_us"]
     assert why.keys() >= one.keys()
     assert settled({key: why[key] for key in one}) == settled(one)
     assert (one["file"], one["enabled"], one["nodes_total"]) == (str(flow), False, 3)
     assert one["restart_budget"] == {"used": 0, "max": 5, "next_us": None, "resets_us": None}
-    assert abs(one["started_us"] - look["at_us"]) < 600_000_000
-    assert one["started"].endswith("Z")
+    assert abs(one["ready_us"] - look["at_us"]) < 600_000_000
+    assert one["ready"].endswith("Z")
     assert one["ended"] is None
 
 
@@ -100,8 +102,10 @@ def test_one_that_has_ended(cell: Cell, project: Project) -> None:
     wait_for("it is gone", lambda: cell.is_gone)
     listed = found(cell, "list", cell.name, status=ExitCode.NOT_RUNNING)
     why = found(cell, "why", cell.name)
-    assert {key: why[key] for key in listed} == listed
-    assert (listed["started"], listed["uptime_us"], listed["nodes_total"]) == (None, None, None)
+    told = {key: value for key, value in listed.items() if value is not None}
+    assert {key: why[key] for key in told} == told
+    assert why["started_us"] < why["ready_us"] < why["ended_us"]
+    assert (listed["ready"], listed["uptime_us"], listed["nodes_total"]) == (None, None, None)
     assert listed["ended_us"] > 0
 
 

@@ -66,7 +66,7 @@ def test_a_node_that_crashed_for_good(cell: Cell, project: Project) -> None:
     assert (found["status"], found["cause"], found["node"]) == ("Failed", "node-failed", "bad")
     assert found["summary"] == "node bad: exit code 1"
     assert found["starved"] == ["taker"]
-    assert found["began_us"] < found["at_us"] < found["ended_us"]
+    assert found["started_us"] < found["at_us"] < found["ended_us"]
     lines = [one["text"] for one in found["last_lines"]]
     assert len(lines) == 20
     assert "line 30" in lines

@@ -188,7 +188,7 @@ def format_dataflows(
     """The table of `doractl list`, for a terminal of that width.
 
     With RELEASE if any of them is deployed, with ENDED if any has ended, and with WHY if any has
-    ended or waits.
+    ended, waits or is degraded.
     """
     return format_table(*dataflow_table(rows), width, want_colors)
 
@@ -199,7 +199,7 @@ def dataflow_table(rows: Sequence[DataflowRow]) -> tuple[Sequence[str], list[Seq
     optional = {
         "RELEASE": any(row.release for row in rows),
         "ENDED": not all(map(is_up_word, rows)),
-        "WHY": any(row.status == WAITING or not is_up_word(row) for row in rows),
+        "WHY": any(row.status in _WITH_WHY or not is_up_word(row) for row in rows),
     }
     header = [*_HEADER, *(title for title, is_shown in optional.items() if is_shown)]
     cells = [_dataflow_cells(row, prefixes[row.uuid]) for row in rows]
@@ -223,8 +223,14 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> dict[str, str]:
     }
 
 
+_WITH_WHY = (WAITING, DEGRADED)
+
+
 def _why(row: DataflowRow) -> str:
-    """How it ended, or what it waits for."""
+    """How it ended, what it waits for, or which nodes have failed."""
+    if row.status == DEGRADED:
+        failed = (one for one in row.nodes if one.word == FAILED)
+        return ", ".join(f"node {one.node}: {one.exit}" for one in failed)
     if row.status != WAITING:
         return "" if is_up_word(row) else row.text
     nodes = (format_wait(one.node, one.needs, one.since) for one in row.nodes if one.needs)

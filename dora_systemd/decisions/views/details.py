@@ -18,6 +18,7 @@ from dora_systemd.decisions.views.dataflows import (
     format_percent,
     format_table,
     format_uptime,
+    is_up_word,
     zoned_time,
 )
 from dora_systemd.decisions.views.inhibitors import format_holders
@@ -85,7 +86,8 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("Machines", ", ".join((HEAD, *row.machines)) if row.machines else ""),
         ("Status", _status_words(row)),
         ("Uptime", format_uptime(row.uptime)),
-        ("Started", zoned_time(row.started)),
+        ("Started", zoned_time(row.started) if row.started else ""),
+        ("Ready", zoned_time(row.ready) if is_up_word(row) else ""),
         ("Ended", zoned_time(row.ended) if row.ended else ""),
         ("Nodes", row.problem),
         ("CPU", _cpu_words(row)),

@@ -76,6 +76,7 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
         "inhibitors": list(map(holder_object, row.inhibitors)),
         "uptime_us": row.uptime,
         **moment("started", row.started),
+        **moment("ready", row.ready),
         **moment("ended", row.ended),
         "nodes_alive": row.nodes_alive if is_counted else None,
         "nodes_total": row.nodes_total if is_counted else None,

@@ -72,8 +72,8 @@ PRESSURE = Family(
 )
 STATE = Family("state", "1 for the current state, 0 for all others.")
 RESTARTS = Family("restarts_total", "Automatic restarts; those that somebody asked for are none.")
-START = Family("start_time_seconds", "When all nodes were ready, in Unix time.")
-NODE_START = Family("start_time_seconds", "When it became ready, in Unix time.")
+READY = Family("ready_time_seconds", "When all nodes were ready, in Unix time.")
+NODE_READY = Family("ready_time_seconds", "When it became ready, in Unix time.")
 WATCHDOG = Family("watchdog_seconds", "Time in which it must send WATCHDOG=1.")
 SIGN_AGE = Family("watchdog_age_seconds", "Time since its last WATCHDOG=1.")
 SILENT = Family("silent", "1 while an output that it owes is missing.")
@@ -107,7 +107,7 @@ def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, li
     yield INFO, [({**own, **_identity(one.row)}, 1) for own, one in labelled]
     yield STATE, [s for own, o in labelled for s in _states(own, o.row.status.lower(), STATES)]
     yield RESTARTS, [(own, one.unit_restarts) for own, one in labelled]
-    yield START, [(own, o.row.started / SECOND) for own, o in labelled if o.row.started]
+    yield READY, [(own, o.row.ready / SECOND) for own, o in labelled if o.row.ready]
     yield NODES, [(own, one.row.nodes_total) for own, one in labelled if one.usage]
     yield ALIVE, [(own, one.row.nodes_alive) for own, one in labelled if one.usage]
     yield LOST, [(own, o.lines[WHOLE_CELL].lost) for own, o in labelled if WHOLE_CELL in o.lines]
@@ -130,7 +130,7 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
     yield STATE, [sample for own, _, node in places for sample in _states(own, node.state, states)]
     restarts = [(own, node.restarts) for own, _, node in places]
     yield RESTARTS, [(own, count) for own, count in restarts if count is not None]
-    yield NODE_START, [(own, node.since / SECOND) for own, _, node in places if _is_there(node)]
+    yield NODE_READY, [(own, node.since / SECOND) for own, _, node in places if _is_there(node)]
     yield WATCHDOG, [(own, n.watchdog / SECOND) for own, _, n in places if n.watchdog]
     ages = [(own, node.sign_age) for own, _, node in places]
     yield SIGN_AGE, [(own, age / SECOND) for own, age in ages if age is not None]

@@ -98,6 +98,7 @@ class DataflowRow(NamedTuple):
     text: str = ""
     uptime: int | None = None
     started: int = 0
+    ready: int = 0
     ended: int = 0
     nodes_alive: int = 0
     nodes_total: int = 0

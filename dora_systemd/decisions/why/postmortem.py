@@ -72,6 +72,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         status=status,
         now=facts.text if status in UP_WORDS else "",
         began_us=life.began_us,
+        ready_us=ready.at_us if (ready := life.last("dataflow-started")) else 0,
         invocation=life.invocation,
         is_given_up=is_spent or life.last("start-limit") is not None,
         starved=_starved(found, life),

@@ -243,9 +243,9 @@ def _budget_words(report: Report) -> str:
 
 
 def _when(verdict: Verdict) -> str:
-    since = f"started {zoned_time(verdict.began_us)}" if verdict.began_us else ""
     if not verdict.at_us:
-        return since
+        times = {"started": verdict.began_us, "ready": verdict.ready_us}
+        return ", ".join(f"{name} {zoned_time(at)}" for name, at in times.items() if at)
     lasted = verdict.at_us - verdict.began_us
     is_told = verdict.began_us and lasted >= _MILLISECOND
     words = f", {_span(lasted)} after its start" if is_told else ""

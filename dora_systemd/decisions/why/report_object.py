@@ -36,7 +36,9 @@ def report_object(report: Report, row: DataflowRow) -> dict[str, Any]:
         "now": verdict.now or None,
         "node": verdict.node or None,
         **moment("at", verdict.at_us),
-        **moment("began", verdict.began_us),
+        # systemd's own times, as long as it has them.
+        **moment("started", row.started or verdict.began_us),
+        **moment("ready", row.ready or verdict.ready_us),
         "stopped_by": verdict.stopped_by or None,
         "given_up": verdict.is_given_up,
         "details": _details(verdict.details),

@@ -50,12 +50,12 @@ class Verdict:
 
     status: a word of `list`. summary: what ended and how. now: STATUS= of a running one. node: the
     node that failed first, or "". others: those that failed by themselves after it. at_us: time of
-    that; began_us: beginning of that life; CLOCK_REALTIME µs, 0: unknown. invocation: systemd's id
-    of that life. details: other facts about the end. is_given_up: systemd's start limit is reached.
-    is_passing: dora restarts the node. starved: nodes downstream. restarts: those that `list`
-    counts, oldest first. before: how the life before these ended, and when. nodes: of a dataflow
-    that has ended, as its events name them. stopped: nodes of one that is up which somebody has
-    stopped, and who. policy: see Facts.
+    that; began_us, ready_us: beginning of that life, and when all nodes were ready; CLOCK_REALTIME
+    µs, 0: unknown. invocation: systemd's id of that life. details: other facts about the end.
+    is_given_up: systemd's start limit is reached. is_passing: dora restarts the node. starved:
+    nodes downstream. restarts: those that `list` counts, oldest first. before: how the life before
+    these ended, and when. nodes: of a dataflow that has ended, as its events name them. stopped:
+    nodes of one that is up which somebody has stopped, and who. policy: see Facts.
     """
 
     status: str
@@ -65,6 +65,7 @@ class Verdict:
     node: str = ""
     at_us: int = 0
     began_us: int = 0
+    ready_us: int = 0
     invocation: str = ""
     stopped_by: str = ""
     is_given_up: bool = False

@@ -71,7 +71,8 @@ def _with_end(row: DataflowRow, report: Report) -> DataflowRow:
         nodes_total=len(verdict.nodes),
         restarts=len(verdict.restarts),
         started=verdict.began_us,
-        ended=verdict.at_us or row.ended,
+        ready=verdict.ready_us,
+        ended=row.ended or verdict.at_us,
     )
 
 

@@ -123,7 +123,7 @@ export class Detail {
   /** Another state has another reason, and another run may have other nodes and wires. */
   #askAgain(flow) {
     if (flow === this.flow) return;
-    const news = JSON.stringify([flow.status, flow.text, flow.restarts, flow.started_us,
+    const news = JSON.stringify([flow.status, flow.text, flow.restarts, flow.ready_us,
       flow.release]);
     // Twice, because the journal may be behind.
     if (news !== this.news) this.asks = 2;
@@ -132,7 +132,7 @@ export class Detail {
       this.askAbout();
     }
     if (flow.release && this.releases.isNext()) this.send({ type: "releases" });
-    if (this.flow && this.flow.started_us !== flow.started_us) this.send({ type: "graph" });
+    if (this.flow && this.flow.ready_us !== flow.ready_us) this.send({ type: "graph" });
     this.news = news;
   }
 
@@ -140,8 +140,8 @@ export class Detail {
   #withEnd(flow) {
     const row = this.about?.row;
     if (isUp(flow) || !row || isUp(row)) return flow;
-    const { nodes, restarts, nodes_total, started_us, ended_us } = row;
-    return { ...flow, nodes, restarts, nodes_total, started_us, ended_us };
+    const { nodes, restarts, nodes_total, started_us, ready_us, ended_us } = row;
+    return { ...flow, nodes, restarts, nodes_total, started_us, ready_us, ended_us };
   }
 
   #showNodes(flow, isFree) {

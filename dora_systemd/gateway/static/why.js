@@ -92,7 +92,7 @@ export class Why {
   #facts(why) {
     const facts = new Facts();
     Object.assign(this, { facts, at: why.at_us });
-    const lasted = why.began_us && why.at_us ? why.at_us - why.began_us : -1;
+    const lasted = why.started_us && why.at_us ? why.at_us - why.started_us : -1;
     facts.show("Since", why.at_us ? since(why.at_us) : "");
     facts.show("After its start", lasted >= 0 ? span(lasted) : "");
     facts.show("Node", why.node ?? "");

@@ -28,6 +28,7 @@ from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reading import (
     ENDED,
+    PROCESS_STARTED,
     STARTED,
     UP_SINCE,
     Reading,
@@ -123,10 +124,11 @@ def mark_enabled(manager: Manager, scope: Scope, rows: Sequence[DataflowRow]) ->
 def _life(reading: Reading) -> dict[str, Any]:
     """Times of the current run; the monotonic ones do not depend on the setting of the clock."""
     since, started = reading.unit[UP_SINCE], reading.unit.get(STARTED, 0)
+    life = {"started": reading.unit.get(PROCESS_STARTED, 0)}
     if since < started:
-        return {"uptime": reading.at_us - started}
-    started_us = reading.unit.get("ActiveEnterTimestamp", 0)
-    return {"uptime": reading.at_us - since, "started": started_us}
+        return {**life, "uptime": reading.at_us - started}
+    ready_us = reading.unit.get("ActiveEnterTimestamp", 0)
+    return {**life, "uptime": reading.at_us - since, "ready": ready_us}
 
 
 def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:

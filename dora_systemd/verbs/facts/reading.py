@@ -28,8 +28,9 @@ if TYPE_CHECKING:  # the table of `list` does without
 UP_SINCE = "ActiveEnterTimestampMonotonic"
 STARTED = "InactiveExitTimestampMonotonic"
 ENDED = "InactiveEnterTimestamp"
+PROCESS_STARTED = "ExecMainStartTimestamp"
 _TEXT, _READY_AT = "StatusText", "ActiveEnterTimestamp"
-_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, _TEXT, _READY_AT)
+_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, _TEXT, _READY_AT, PROCESS_STARTED)
 
 
 class Reading(NamedTuple):

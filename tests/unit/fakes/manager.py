@@ -80,6 +80,7 @@ class FakeManager:
             "ExecMainCode": 1,
             "ExecMainStatus": 0,
             "ActiveEnterTimestamp": 0,
+            "ExecMainStartTimestamp": 0,
             "ActiveEnterTimestampMonotonic": 0,
             "InactiveExitTimestamp": 0,
             "InactiveExitTimestampMonotonic": 0,

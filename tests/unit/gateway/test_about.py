@@ -74,7 +74,7 @@ def test_a_failed_one_with_its_reason_and_its_nodes(bench: Bench) -> None:
     assert (row["status"], row["restarts"], row["nodes_total"]) == ("Failed", 0, 1)
     (node,) = row["nodes"]
     assert (node["node"], node["state"], node["exit"]) == ("a", "failed", "exit code 3")
-    assert (row["started_us"], row["ended_us"]) == (10, 30)
+    assert (row["started_us"], row["ended_us"], found["why"]["at_us"]) == (10, 40, 30)
     assert found["facts"]["hot_reload"] is False
     json.dumps(found)
 

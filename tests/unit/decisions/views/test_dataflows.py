@@ -1,5 +1,7 @@
 """Words and whole tables of `doractl list`."""
 
+import re
+
 import pytest
 
 from dora_systemd.decisions.views.dataflows import (
@@ -185,7 +187,7 @@ def test_a_long_name_leaves_room_for_the_reason() -> None:
 
 def test_a_narrow_terminal() -> None:
     long = ROWS[0]._replace(uuid=C, name="a-very-long-name-of-a-dataflow-that-fits-nowhere")
-    rows = [ROWS[0], ROWS[1]._replace(status="Degraded"), long]
+    rows = [ROWS[0], ROWS[1]._replace(status="Restarting"), long]
     whole = format_dataflows(rows)
     assert format_dataflows(rows, 200) == whole
     for width in (60, 70, 80, 100):
@@ -215,7 +217,7 @@ def test_one_dataflow() -> None:
         "File:     /srv/robot.yml\n"
         "Status:   Running (2/2 nodes running)\n"
         "Uptime:   00:05:32\n"
-        "Started:  -\n"
+        "Ready:    -\n"
         "CPU:      12.5%\n"
         "Memory:   256M\n"
         "Restarts: 0 of the dataflow by systemd, 3 of single nodes by dora\n"
@@ -225,6 +227,21 @@ def test_one_dataflow() -> None:
         "camera    Running   42   5.0  128M  200M         0  -\n"
         "detector  Failed     -     -     -     -         3  exit code 1"
     )
+
+
+def test_times_have_names() -> None:
+    shown = format_dataflow(ROWS[0]._replace(started=1, ready=2 * SECOND))
+    assert re.search(r"Started: +1970-01-01 \S+ \S+\nReady: +1970-01-01 ", shown)
+    values = dataflow_object(ROWS[0]._replace(started=1, ready=2))
+    assert (values["started_us"], values["ready_us"], values["ended_us"]) == (1, 2, None)
+
+
+def test_the_table_says_why_one_is_degraded() -> None:
+    rows = (ROWS[0]._replace(status="Degraded"), ROWS[0])
+    header, line, other = format_dataflows(rows).splitlines()
+    assert header.endswith("WHY")
+    assert line.endswith("node detector: exit code 1")
+    assert other.endswith("-")
 
 
 def test_the_reason_stands_behind_the_status() -> None:

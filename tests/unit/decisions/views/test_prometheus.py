@@ -27,7 +27,7 @@ ROBOT = Observed(
         "robot",
         "dora-robot.service",
         "Degraded",
-        started=1_700_000_000_500_000,
+        ready=1_700_000_000_500_000,
         nodes_alive=1,
         nodes_total=2,
         nodes=(
@@ -88,7 +88,7 @@ def value(found: Mapping[str, Metric], name: str, **labels: str) -> float:
         ("memory_limit_bytes", 1 << 30),
         ("oom_kills_total", 4),
         ("restarts_total", 2),
-        ("start_time_seconds", 1_700_000_000.5),
+        ("ready_time_seconds", 1_700_000_000.5),
         ("nodes", 2),
         ("nodes_alive", 1),
     ],
@@ -102,14 +102,14 @@ def test_numbers_of_nodes() -> None:
     own = {"dataflow": "robot", "node": "camera"}
     assert value(found, "dora_node_cpu_seconds_total", **own) == 1.0
     assert value(found, "dora_node_restarts_total", **own) == 3
-    assert value(found, "dora_node_start_time_seconds", **own) == 1_700_000_001
+    assert value(found, "dora_node_ready_time_seconds", **own) == 1_700_000_001
     assert value(found, "dora_node_log_lines_total", **own) == 1000
     assert value(found, "dora_node_log_lines_suppressed_total", **own) == 20
     assert value(found, "dora_dataflow_log_lines_lost_total", dataflow="robot") == 7
     # No limit is no number; what is not there has no time at which it became ready.
     assert "dora_node_memory_limit_bytes" not in found
     assert "dora_node_memory_peak_bytes" not in found
-    assert len(found["dora_node_start_time_seconds"].samples) == 1
+    assert len(found["dora_node_ready_time_seconds"].samples) == 1
 
 
 def test_signs_of_life() -> None:

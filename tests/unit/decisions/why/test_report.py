@@ -157,6 +157,11 @@ def test_when_it_was(began_us: int, at_us: int, words: str | None) -> None:
     assert found.get("When") == words
 
 
+def test_when_it_was_ready() -> None:
+    found = facts(replace(VERDICT, began_us=BEGAN, ready_us=CRASHED, at_us=0))
+    assert found["When"] == "started 2026-01-15 13:00:00 UTC, ready 2026-01-15 13:00:05 UTC"
+
+
 @pytest.mark.parametrize(
     ("details", "words"),
     [
@@ -390,8 +395,8 @@ ROW = DataflowRow(UUID, "robot", "dora-robot.service", "Restarting", "/etc/robot
 
 def test_the_same_for_programs() -> None:
     undone = Switch(CRASHED, "mine", OLD, FAILED, "root", "node b: y", "b", "id")
-    found = report_object(replace(FULL, undone=undone), ROW)
-    began, at = found["began"], found["at"]
+    found = report_object(replace(FULL, undone=undone), ROW._replace(ready=BEGAN + SECOND))
+    began, at = found["started"], found["at"]
     assert began.startswith("2026-01-15T13:00:00")
     assert at.startswith("2026-01-15T13:00:05")
     wanted = {
@@ -403,7 +408,8 @@ def test_the_same_for_programs() -> None:
         "now": None,
         "node": "camera",
         "at_us": CRASHED,
-        "began_us": BEGAN,
+        "started_us": BEGAN,
+        "ready_us": BEGAN + SECOND,
         "stopped_by": None,
         "given_up": False,
         "details": {
@@ -450,7 +456,7 @@ def test_what_is_not_known_is_null() -> None:
     found = report_object(
         Report(SUBJECT, Verdict("Stopped", stopped_by="root", now="x")), ROW._replace(dataflow="")
     )
-    keys = ("cause", "summary", "node", "at", "at_us", "began", "began_us", "before", "undone")
+    keys = ("cause", "summary", "node", "at", "at_us", "started_us", "ready_us", "before", "undone")
     assert {found[key] for key in keys} == {None}
     assert (found["stopped_by"], found["now"], found["details"]) == ("root", "x", {})
     assert found["file"] == "/srv/robot.yml", "the journal knows it when systemd does not"

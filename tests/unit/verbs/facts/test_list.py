@@ -141,7 +141,8 @@ def test_the_table_asks_for_less_and_says_the_same(
     started = now_us() - 40 * SECOND
     times = {"InactiveExitTimestampMonotonic": started}
     times["ActiveEnterTimestampMonotonic"] = started + (SECOND if active == "active" else -SECOND)
-    manager.add(options(), active=active, ControlGroup=group, NRestarts=1, **times)
+    started_us = {"ExecMainStartTimestamp": 7, "ActiveEnterTimestamp": 9}
+    manager.add(options(), active=active, ControlGroup=group, NRestarts=1, **times, **started_us)
     samples = (CpuSample(now_us() - 4 * SECOND, {"": 2 * SECOND}),) if has_samples else ()
     status = CellStatus(nodes={"camera": NodeStatus("running", 42)}, samples=samples)
     write_status(scope, status)
@@ -149,6 +150,9 @@ def test_the_table_asks_for_less_and_says_the_same(
     (line,) = table_of(manager, scope)
     assert (line.memory is None) == (active == "failed")
     now: dict[str, Any] = {"uptime": None, "cpu_percent": None, "nodes": (), "dataflow": ""}
+    is_up, is_ready = active != "failed", active == "active"
+    assert (all_of_it.started, all_of_it.ready) == (7 * is_up, 9 * is_ready)
+    now |= {"started": 0, "ready": 0}
     assert line._replace(**now) == all_of_it._replace(**now)
     for mine, other in ((line.uptime, all_of_it.uptime), (line.cpu_percent, all_of_it.cpu_percent)):
         assert mine == (other and pytest.approx(other, rel=0.1))
@@ -426,6 +430,6 @@ def test_a_snapshot_says_what_systemd_does(manager: FakeManager, scope: Scope) -
         "ControlGroup": "/dora.slice/dora-robot0.service",
     }
     (observed,), (row,) = read_snapshot(manager, scope), read_rows(manager, scope)
-    assert row.started == SECOND
+    assert row.ready == SECOND
     alike: dict[str, Any] = {"uptime": 0, "cpu_percent": 0.0}
     assert observed.row._replace(**alike) == row._replace(**alike)
