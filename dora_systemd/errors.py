@@ -49,6 +49,19 @@ class DoraSystemdError(Exception):
         self.code = code
 
 
+class WrongKey(DoraSystemdError):
+    """A settings file has a wrong key or value. source: its path. place: the keys down to there."""
+
+    def __init__(self, message: str, hint: str, source: str, place: Sequence[str]) -> None:
+        super().__init__(message, hint, ExitCode.BAD_INPUT)
+        self.source, self.place = source, tuple(place)
+
+    def at_line(self, line: int) -> DoraSystemdError:
+        """The error with the number of the line, which is 0 if it is not known."""
+        where = f" at line {line}" if line else ""
+        return DoraSystemdError(f"{self.message}{where}", self.hint, self.code)
+
+
 class TimedOut(DoraSystemdError):
     """A check took too long. It says nothing of what was checked, so a restart may help."""
 

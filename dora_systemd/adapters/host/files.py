@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -61,6 +62,27 @@ def read_yaml(path: Path, allow_empty: bool = False) -> object:
     however often it is used: limit any walk over the result.
     """
     return parse_yaml(read_text(path), path, allow_empty)
+
+
+def find_line(text: str, keys: Sequence[str]) -> int:
+    """The line, counted from 1, of the key to which `keys` lead in a YAML document; 0 is unknown.
+
+    text: what parse_yaml() has accepted.
+    """
+    import yaml
+
+    from dora_systemd.adapters.host.yaml_loader import Loader
+
+    node, line = yaml.compose(text, Loader=Loader), 0
+    for name in keys:
+        pairs = node.value if isinstance(node, yaml.MappingNode) else ()
+        for key, value in pairs:
+            if key.value == name:
+                node, line = value, key.start_mark.line + 1
+                break
+        else:
+            break
+    return line
 
 
 def parse_yaml(text: str, path: Path, allow_empty: bool = False) -> object:

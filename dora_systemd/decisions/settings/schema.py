@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from dora_systemd.decisions.descriptor.json_size import refusal
 from dora_systemd.decisions.settings.kinds import Setting
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, WrongKey
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import quoted
 
@@ -47,7 +47,8 @@ def validation_error(
         key = next((part for part in reversed(place) if part in settings), place[0])
         expected = settings[key].kind.expected if key in settings else "a mapping"
         reason, hint = f"the value of {key} is of another type", f"write {expected}"
-    return refusal(source, reason, hint)
+    refused = refusal(source, reason, hint)
+    return WrongKey(refused.message, refused.hint, source, place)
 
 
 def _fields(table: Sequence[Setting[Any]]) -> dict[str, Any]:

@@ -1,15 +1,15 @@
 """Reads the settings of a dataflow that is to be started, and checks whose files to trust."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.adapters.host.files import decoded, find_line, parse_yaml
 from dora_systemd.decisions.rights.node_rights import BY_KEY
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope, config_home
 from dora_systemd.trust.files import read_file
@@ -67,17 +67,29 @@ def read_settings(
     beside, *elsewhere = settings_files(dataflow, environment)
     found = [read_settings_file(beside, origin)] if exists(beside) else []
     found += [read_settings_file(path) for path in elsewhere if exists(path)]
-    documents = [(str(one.path), one.document) for one in found]
     others = [] if scope.is_user else [one for one in found if not one.is_roots]
     for one in others:
         require_modest(one)
-    settings = resolve_settings(flags, environment, documents, SETTINGS)
+    settings = _resolved(found, flags, environment)
     if not any(ENV_FILE.name in one.words() for one in others):
         return settings
-    documents = [(str(one.path), one.document) for one in found if one not in others]
-    roots = resolve_settings(flags, environment, documents, SETTINGS)
+    roots = _resolved([one for one in found if one not in others], flags, environment)
     named, by_root = settings[ENV_FILE], roots[ENV_FILE]
     return replace(settings, lent=frozenset(one for one in named if one not in by_root))
+
+
+def _resolved(
+    files: Sequence[SettingsFile],
+    flags: Mapping[str, object] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> Settings:
+    """The settings from flags, variables and `files`; an error names the line of a wrong key."""
+    documents = [(str(one.path), one.document) for one in files]
+    try:
+        return resolve_settings(flags or {}, environment or {}, documents, SETTINGS)
+    except WrongKey as error:
+        (text,) = (decoded(one.data, one.path) for one in files if str(one.path) == error.source)
+        raise error.at_line(find_line(text, error.place)) from error
 
 
 def config_file(scope: Scope, environment: Mapping[str, str]) -> Path:
@@ -96,8 +108,7 @@ def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
     for one in found:
         if not scope.is_user and not one.is_roots:
             _check_trust(one)
-    documents = [(str(one.path), one.document) for one in found]
-    return resolve_settings({}, {}, documents, SETTINGS)
+    return _resolved(found)
 
 
 def check_config(scope: Scope, path: Path) -> None:
@@ -105,7 +116,7 @@ def check_config(scope: Scope, path: Path) -> None:
     read = read_settings_file(path)
     if not scope.is_user and not read.is_roots:
         require_modest(read)
-    resolve_settings({}, {}, [(str(path), read.document)], SETTINGS)
+    _resolved([read])
 
 
 def require_modest(read: SettingsFile) -> None:
@@ -123,7 +134,7 @@ def read_settings_file(path: Path, origin: Place | None = None) -> SettingsFile:
 
 def _check_values(read: SettingsFile) -> None:
     """Refuse values by which another user's file would get more than that user has."""
-    own = resolve_settings({}, {}, [(str(read.path), read.document)], SETTINGS)
+    own = _resolved([read])
     for key, flag in _raising(own):
         raise _untrusted(read, key, flag)
 

@@ -24,7 +24,7 @@ from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
-from dora_systemd.verbs.start.settings import read_settings, settings_files
+from dora_systemd.verbs.start.settings import check_config, read_settings, settings_files
 from tests.unit.fakes.programs import make_dora, make_program
 
 USER = Scope(is_user=True, uid=os.getuid())
@@ -182,6 +182,25 @@ def test_settings_files(tmp_path: Path) -> None:
     assert settings_files(flow, {}) == [beside, system]
     # A relative path in the variable is not valid.
     assert settings_files(flow, {**home, "XDG_CONFIG_HOME": "c"})[1] == user
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("uv: true\nmemory_limi: 1\n", "unknown key 'memory_limi' at line 2"),
+        ("nodes:\n  plot: {}\n  camera:\n    cpuu: 1\n", "of node 'camera' at line 4"),
+        ("\nnodes: {camera: {cpuu: 1}}\n", "unknown key 'cpuu' of node 'camera' at line 2"),
+        ("uv: [1]\n", "the value of uv is of another type at line 1"),
+    ],
+)
+def test_a_wrong_key_is_named_with_its_line(project: Path, text: str, words: str) -> None:
+    path = project / "robot.systemd.yml"
+    path.write_text(text)
+    with pytest.raises(DoraSystemdError) as caught:
+        read_settings(USER, project / "robot.yml", {}, {})
+    assert caught.value.message.endswith(words)
+    with pytest.raises(DoraSystemdError, match="at line "):
+        check_config(USER, path)
 
 
 def test_settings_beside_the_dataflow(project: Path) -> None:
