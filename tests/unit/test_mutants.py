@@ -2,10 +2,12 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
 
+from tests.mutants import fresh
 from tests.mutants.__main__ import FOLDERS, TEXTS, add_tests
 from tests.mutants.kept import KEPT, find_reason
 from tests.mutants.outcome import Change, Mutant, find_line, format_table, read_change, read_mutants
@@ -95,6 +97,17 @@ def test_a_function_has_the_tests_of_its_module(tmp_path: Path) -> None:
     gate, other = tests
     function = NAME.removesuffix("__mutmut_12")
     assert found == {"dora_systemd.trust.gate.x_called": [other, gate], function: [gate]}
+
+
+def test_the_tables_of_tests_are_made_again_for_each_mutant() -> None:
+    before = dict(sys.modules)
+    try:
+        fresh.pytest_configure()
+        gone = before.keys() - sys.modules.keys()
+    finally:
+        sys.modules.update(before)
+    assert __name__ in gone
+    assert all(one.rpartition(".")[2].startswith("test_") for one in gone)
 
 
 def test_the_folders_and_their_tests_are_there() -> None:
