@@ -46,7 +46,11 @@ def judge_real_time(facts: RealTime) -> Iterator[Finding]:
 
 
 def _scheduling(facts: RealTime) -> Finding:
-    if facts.is_granted or (facts.is_granted is None and not facts.has_groups):
+    is_possible = facts.is_granted or (facts.is_granted is None and not facts.has_groups)
+    if is_possible and facts.can_raise is False:  # the limit of the unit stays 0
+        text = f"not even root can raise the limit of realtime priorities: {_REFUSED}"
+        return Finding(TOPIC, State.NOTE, text, "a container needs CAP_SYS_RESOURCE for it")
+    if is_possible:
         return Finding(TOPIC, State.OK, "nodes can have realtime scheduling, if root gives it")
     if facts.has_groups:
         text = f"the kernel has CONFIG_RT_GROUP_SCHED: {_REFUSED}"

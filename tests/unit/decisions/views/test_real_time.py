@@ -11,6 +11,7 @@ from dora_systemd.decisions.views.real_time import RealTime, judge_cpuset, judge
     [
         (RealTime(), State.OK, "if root gives it"),
         (RealTime(has_groups=True, is_granted=True), State.OK, "if root gives it"),
+        (RealTime(is_granted=True, can_raise=True), State.OK, "if root gives it"),
         (RealTime(has_groups=True), State.NOTE, "CONFIG_RT_GROUP_SCHED"),
         (RealTime(has_groups=True, is_granted=False), State.NOTE, "CONFIG_RT_GROUP_SCHED"),
         (RealTime(has_groups=False, is_granted=False), State.NOTE, "even to root"),
@@ -24,8 +25,13 @@ def test_scheduling(facts: RealTime, state: State, words: str) -> None:
 
 
 def test_a_container_without_the_capability() -> None:
-    _, rights = judge_real_time(RealTime(can_raise=False))
-    assert (rights.topic, rights.state) == ("rights", State.NOTE)
+    for is_granted in (None, True):  # chrt(1) by root needs no limit, a node does
+        facts = RealTime(is_granted=is_granted, can_raise=False)
+        scheduling, rights = judge_real_time(facts)
+        assert (scheduling.topic, scheduling.state) == ("real time", State.NOTE)
+        assert "cannot start" in scheduling.text
+        assert "CAP_SYS_RESOURCE" in scheduling.remedy
+        assert (rights.topic, rights.state) == ("rights", State.NOTE)
     assert len(list(judge_real_time(RealTime(can_raise=True)))) == 1
 
 
