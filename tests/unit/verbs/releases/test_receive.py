@@ -1,5 +1,6 @@
 """A project that another host sends: what of it is written, and where."""
 
+import errno
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +20,13 @@ from dora_systemd.decisions.releases.parcel import Parcel, format_parcel
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import receive
-from dora_systemd.verbs.releases.receive import Known, _fill, _renamed, _require_user
+from dora_systemd.verbs.releases.receive import (
+    Known,
+    _fill,
+    _renamed,
+    _require_space,
+    _require_user,
+)
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.verbs.releases.test_trial import NEW as NEW_ID
 from tests.unit.verbs.releases.test_trial import store
@@ -200,3 +207,15 @@ def test_warnings_name_the_project_as_its_sender_does() -> None:
     heard: list[str] = []
     _renamed(heard.append, "/var/x/.sent/1", "/home/ann/robot")("cannot read /var/x/.sent/1/a.py")
     assert heard == ["cannot read /home/ann/robot/a.py"]
+
+
+@pytest.mark.parametrize(("free", "fits"), [(8, True), (7, False)])
+def test_a_disk_without_room_for_what_is_to_come(free: int, fits: bool) -> None:
+    """Nothing is asked for then."""
+    draft: Any = SimpleNamespace(free_bytes=lambda: free)
+    if fits:
+        _require_space(draft, PARCEL, [0, 1])
+        return
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        _require_space(draft, PARCEL, [0, 1])
+    assert caught.value.errno == errno.ENOSPC

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.releases.draft import Draft
+from dora_systemd.adapters.releases.incoming import incoming
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
@@ -170,6 +171,8 @@ def test_the_end_of_a_first_trial_that_was_killed(
     assert done == Deployed(UUID, "robot", UNIT, "", NEW, 0, 0, 0)
     killed = "the command that tried it was killed"
     assert notes.found(*FACTS) == [STOPPED, ("release-rolled-back", NEW, "", "", killed)]
+    (switch,) = releases.history()
+    assert (switch.former, switch.how, switch.reason) == (NEW, "interrupted", killed)
     assert {one["DORA_BY"].partition(" ")[2] for one in notes.records} == {"(doractl rollback)"}
 
 
@@ -232,6 +235,18 @@ def test_a_unit_of_somebody_else_hides_no_finding(
     rows = read_releases(manager, scope, ["other", "robot"])
     assert {(row.name, row.state) for row in rows} == {("other", "unknown"), ("robot", "proved")}
     assert refusal(lambda: read_releases(manager, scope, ["other"])).message == error.message
+
+
+def test_what_doctor_says_of_a_sender_that_was_killed(
+    manager: FakeManager, scope: Scope, releases: Store
+) -> None:
+    with incoming(releases.path.parent) as draft:
+        left = draft.tree.parent.with_name(".new-0a1b2c3d4e5f")
+        left.mkdir()
+        os.utime(left, (0, 0))
+        text = f"{left} is the rest of a deploy -H that was killed"
+        finding = Finding("releases", State.NOTE, text, "the next one removes it")
+        assert list(judge_releases(manager, scope)) == [finding]
 
 
 def test_what_a_deploy_that_runs_has_made_is_no_rest(
