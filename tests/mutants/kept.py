@@ -38,6 +38,7 @@ KEPT = (
     Kept("runner/cell/boot", r"self\._port = 0 ->", "its readers wait for the thread that sets it"),
     Kept("adapters/logs/held", r"self\._done - lines != ", "it writes again what is noted already"),
     Kept("adapters/logs/jsonl", r"_fd < 1", "0 is standard input"),
+    Kept("adapters/logs/jsonl", r"self\._noted = ", "it writes again what is noted already"),
     Kept("adapters/logs/jsonl", r"_read_chunk\(\) > 1", "the rest is read 50 ms later"),
     Kept("adapters/logs/pipes", r"pipe, None, is_flood", "None is no data, as b'' is"),
     Kept("", r"-> .*time\.monotonic\(\) (<|>)= ", "no clock shows that moment"),

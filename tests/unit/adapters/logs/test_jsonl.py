@@ -6,12 +6,14 @@ import os
 import stat
 from collections.abc import Callable
 from pathlib import Path, PosixPath
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.adapters.logs.jsonl import JsonlTail, resume_tail
+from dora_systemd.adapters.logs.jsonl import POLL_SECONDS, JsonlTail, resume_tail
 from dora_systemd.decisions.logs.fields import Value
 
 
@@ -155,6 +157,40 @@ def test_deleted_before_it_was_read(loop: asyncio.AbstractEventLoop, tmp_path: P
     follower.close()
     assert found == ["0", "1", "3", "4"]
     assert follower.loss == "dora deleted 1 of its log files before they were read"
+
+
+def test_each_deleted_file_is_counted(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, _ = tail(loop, dora)
+    for _ in range(2):
+        dora.write()
+        follower.drain()
+        for _ in range(2):
+            dora.rotate(keep=1)
+            dora.write()
+        follower.drain()
+    follower.close()
+    assert follower.loss == "dora deleted 2 of its log files before they were read"
+
+
+def test_when_it_reads_again(tmp_path: Path) -> None:
+    """At once while there is more: dora may rotate the file."""
+    delays: list[float] = []
+
+    def call_later(delay: float, _: object) -> object:
+        delays.append(delay)
+        return SimpleNamespace(cancel=lambda: None)
+
+    loop: Any = SimpleNamespace(call_later=call_later)
+    dora, busy = Dora(tmp_path), [False]
+    follower = JsonlTail(loop, dora.path, lambda _: None, lambda: busy[0])
+    follower.start()
+    dora.write()
+    for is_busy in (True, False, False):
+        busy[0] = is_busy
+        follower.start()
+    assert delays == [POLL_SECONDS, POLL_SECONDS, 0, POLL_SECONDS]
+    follower.close()
 
 
 def test_backlog_over_rotations(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
