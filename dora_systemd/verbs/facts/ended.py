@@ -86,6 +86,8 @@ def _with_end(manager: Manager, row: DataflowRow, event: LastEvent | None) -> Da
     is_own = event and event.uuid == row.uuid and event.at_us >= times["InactiveExitTimestamp"]
     own = event if is_own else None
     row = row._replace(ended=times["InactiveEnterTimestamp"] or (own.at_us if own else 0))
+    if own and own.event == "dataflow-failed":  # a stop that calls its restart off changes nothing
+        row = row._replace(status=FAILED)
     if row.status != FAILED:
         return row
     if own and own.event == "dataflow-failed":
