@@ -115,11 +115,11 @@ class Reloader:
     def _note_imports(self) -> None:
         """Note the versions of modules, unless that was done in this run. Blocks."""
         with self._noting_lock, contextlib.suppress(DoraSystemdError):  # a program has gone
-            current, now_ns = self.current, time.time_ns()
+            current = self.current
             if current is not None and not self._has_imports:
                 self._has_imports = True
                 for node, files in self._sources.files(current).items():
-                    self._versions.add(node, files, self._begun_ns, now_ns)
+                    self._versions.add(node, files, self._begun_ns)
 
     def go_back(self, reason: str) -> bool:
         """Switch back if a run failed before it had started; whether there is a version before."""

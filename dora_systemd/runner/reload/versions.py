@@ -1,5 +1,6 @@
 """Remembers which versions of its files each node was started with."""
 
+import time
 from collections.abc import Iterable, Iterator
 
 from dora_systemd.adapters.host.watch import Identity, identity
@@ -22,13 +23,16 @@ class Versions:
         """Note what was taken before, once it is true."""
         self._known |= taken._known
 
-    def add(self, node: str, paths: Iterable[str], begun_ns: int, now_ns: int) -> None:
+    def add(self, node: str, paths: Iterable[str], begun_ns: int) -> None:
         """Note the present versions of those `paths` that are not known yet.
 
         A file that was written since `begun_ns` stays unknown: the node may run an older version.
+        One that seems to be written later than now is from before somebody set the clock.
         """
         known = self._known.setdefault(node, {})
-        for path, one in _identities(set(paths) - known.keys()).items():
+        present = _identities(set(paths) - known.keys())
+        now_ns = time.time_ns()  # not earlier: a file can be saved while others are looked up
+        for path, one in present.items():
             if one is None or not begun_ns < one.changed_ns <= now_ns:
                 known[path] = one
 
