@@ -1,5 +1,6 @@
 """Carries out the steps of a history, and records what comes of them."""
 
+import contextlib
 import json
 import shutil
 import subprocess
@@ -210,8 +211,9 @@ def _states() -> list[dict[str, str]]:
 
 def _state_of(cell: str) -> dict[str, str]:
     found = properties(f"dora-{cell}.service")
-    path = Cell(cell).paths.status
-    status = Cell(cell).status if path.exists() else None
+    status = None
+    with contextlib.suppress(FileNotFoundError):  # its directory goes with the dataflow
+        status = Cell(cell).status
     states = status.nodes.values() if status else ()
     found["nodes"] = " ".join(map(_word, states))
     # A node can have died a moment before the runner hears of it.
