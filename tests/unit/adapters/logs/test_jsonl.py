@@ -275,11 +275,15 @@ def test_waits_while_the_journal_is_busy(tmp_path: Path) -> None:
 
 
 class Watched(PosixPath):
-    """Lets dora do something right after it has been looked at, once."""
+    """Lets dora do something right before or after it is looked at, once."""
 
+    before: Callable[[], object] | None = None
     after: Callable[[], object] | None = None
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
+        if before := self.before:
+            self.before = None
+            before()
         found = super().stat(follow_symlinks=follow_symlinks)
         if after := self.after:
             self.after = None
@@ -302,10 +306,10 @@ def test_what_dora_writes_just_before_it_rotates_the_file(
         dora.rotate(keep=2)
         dora.write(2)
 
-    watched.after = write_and_rotate
-    assert follower.drain() is False, "it looks at the files, and has nothing to read"
-    watched.after = None
-    follower.drain()
+    watched.before = write_and_rotate
+    follower.start()
+    assert found == numbers(4), "first the rest of the old file"
+    follower.start()
     follower.close()
     assert (found, follower.lost_files) == (numbers(6), 0)
 
