@@ -44,7 +44,7 @@ class Step:
 @dataclass(frozen=True)
 class Result:
     """How a step ended. summary: pytest's, or "done". cpu: seconds of processor time, of all that
-    it has started and waited for; a lab waits for all of its container or machine."""
+    it has started and waited for; that of a container is not in it."""
 
     name: str
     status: int
@@ -110,7 +110,8 @@ def say_results(results: Sequence[Result], seconds: float) -> None:
     """One line for each step, and one for all, as pytest writes it."""
     for result in results:
         word = f"FAILED with exit status {result.status}" if result.status else "ok"
-        say(f"{result.name}: {word}; {result.summary}; {result.cpu:.0f} s of processor time")
+        used = f"{result.cpu:.0f} s of processor time outside of containers"
+        say(f"{result.name}: {word}; {result.summary}; {used}")
     sys.stderr.flush()
     print(f"===== {total(results)} in {seconds:.2f}s =====", flush=True)
 

@@ -93,7 +93,7 @@ def test_arguments_directory_and_environment(flow: Path) -> None:
     for case in cases:
         assert ours[case]["argv"] == bare[case]["argv"], case
         assert ours[case]["cwd"] == bare[case]["cwd"], case
-        assert ours[case]["ignored"] == bare[case]["ignored"] == 0, "signals of glibc"
+        assert ours[case]["ignored"] == 0, "signals of glibc"  # dora leaves what su had
     assert ours["path-here"]["env"]["RUST_LOG"] == bare["path-here"]["env"]["RUST_LOG"] == "warn"
     for name, variables in VARIABLES.items():
         case = f"env-{name}"
