@@ -20,8 +20,8 @@ _SEQUENCES = re.compile(
     r"|\x1b[@-Z\\-_]"
 )
 _COLORS = re.compile(r"\x1b\[[0-9;:]*m")
-COLORS = re.compile(_COLORS.pattern.encode())
-"""Sequences that set colours."""
+COLOR_BYTES = re.compile(_COLORS.pattern.encode())
+"""Sequences that set colours, in bytes."""
 _RESET = "\x1b[0m"
 
 

@@ -29,7 +29,7 @@ from dora_systemd.verbs.facts.list import mark_enabled, read_rows
 from dora_systemd.verbs.facts.lives import now_boot, read_lives
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
-from dora_systemd.verbs.facts.restarts import read_restarts
+from dora_systemd.verbs.facts.restarts import read_restarts, without_refused
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.whole import read_whole_rows
 
@@ -144,7 +144,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         return _held_facts(manager, cell)
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     nodes, spent = status.nodes.items(), node_table.spent(status.nodes)
-    unit = manager.read(cell.unit, ["StatusText", "ControlGroup"])
+    unit = manager.read(cell.unit, ["StatusText", "NRestarts", "ControlGroup"])
     group = unit["ControlGroup"]
     is_frozen = bool(group) and cgroup.is_frozen(cgroup.group_path(group))
     return Facts(
@@ -153,7 +153,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         {key: spent.get(key, str(node.exit)) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),
         now_boot(),
-        read_restarts(manager, cell),
+        without_refused(manager, cell, unit["NRestarts"]),
         {key: node.silent for key, node in nodes if node.silent},
         is_gathering=status.stage == GATHERING,
         stopped={key: node.asked_by for key, node in nodes if is_stopped(node)},

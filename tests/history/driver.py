@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.releases.store import store_root
-from dora_systemd.decisions.cell.asked import is_stopped
+from dora_systemd.decisions.cell.asked import is_stopping
 from dora_systemd.decisions.cell.status import NodeStatus
 from tests.history import member
 from tests.history.history import Answer, History, Look
@@ -224,8 +224,7 @@ def _state_of(cell: str) -> dict[str, str]:
 
 def _word(node: NodeStatus) -> str:
     """Its state; a node that was stopped has its grace duration to end."""
-    is_ending = is_stopped(node) and node.pid and not node.is_held
-    return "stopping" if is_ending else node.state
+    return "stopping" if is_stopping(node) else node.state
 
 
 def _is_steady(state: dict[str, str]) -> bool:

@@ -33,8 +33,8 @@ from dora_systemd.verbs.releases.deploy import (
     deploy,
 )
 from dora_systemd.verbs.releases.receive import compare_sent, receive
-from dora_systemd.verbs.start.linger import ensure_linger, linger_note
-from dora_systemd.verbs.start.logins import has_run_here
+from dora_systemd.verbs.start.linger import ensure_linger
+from dora_systemd.verbs.start.logins import logout_note
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest
 
 _INPUT = 0
@@ -117,7 +117,7 @@ def command(
         raise DoraSystemdError("cannot build in no time", "give a --build-timeout", ExitCode.USAGE)
     how, build_timeout = if_inhibited(force, wait), 0 if no_build else build_timeout
     request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout, allow_waiting)
-    note = "" if has_run_here(scope) else linger_note(scope)
+    note = logout_note(scope)
     with open_progress(is_quiet) as progress:
         warn = progress.warn
         if from_stdin:

@@ -35,8 +35,8 @@ from dora_systemd.verbs.start.claim import require_free_name
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.job import Started, format_started, start_unit
 from dora_systemd.verbs.start.launch import Claim, claim
-from dora_systemd.verbs.start.linger import ensure_linger, linger_note
-from dora_systemd.verbs.start.logins import has_run_here, start_notes
+from dora_systemd.verbs.start.linger import ensure_linger
+from dora_systemd.verbs.start.logins import has_run_here, logout_note, start_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
@@ -116,9 +116,8 @@ def command(
     claimed = claim(bus, scope, request, "doractl start", want_boot)
     print_warnings(claimed.warnings)
     print_warnings([ensure_linger(scope) if want_boot else ""])
-    notes = [*claimed.plan.notes]
-    if not has_run_here(scope):
-        notes += [*start_notes(claimed.plan), "" if want_boot else linger_note(scope)]
+    logins = () if has_run_here(scope) else start_notes(claimed.plan)
+    notes = [*claimed.plan.notes, *logins, "" if want_boot else logout_note(scope)]
     if want_logs:
         return _attach(bus, claimed, notes)
     options = claimed.plan.options
@@ -166,7 +165,7 @@ def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
         return print_outcomes([Outcome(cell, text, is_news=False, details=details)])
     bus.hold(cell.unit)  # keep a failed transient unit
     bus.reset_failed(cell.unit)
-    note = "" if has_run_here(scope) else linger_note(scope)
+    note = logout_note(scope)
     with _last_words(bus, scope, cell.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, cell.options, None, stage, wait)
     print_warnings([note, *waiting_notes(bus, cell.options)])

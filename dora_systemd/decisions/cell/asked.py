@@ -24,6 +24,11 @@ def is_stopped(node: NodeStatus) -> bool:
     return node.asked == STOP
 
 
+def is_stopping(node: NodeStatus) -> bool:
+    """Whether a node that somebody has stopped has still a process, other than its launcher."""
+    return is_stopped(node) and bool(node.pid) and not node.is_held
+
+
 def format_stopped(stopped: Mapping[str, str]) -> str:
     """As "plot, requested by root (doractl node stop)"; "" if nobody has stopped a node.
 

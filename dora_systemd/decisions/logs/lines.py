@@ -57,9 +57,8 @@ class LineSplitter:
         lines = whole.split(b"\n")
         if b"\r" in whole:
             *ended, last = lines
-            *begun, rest = last.split(b"\r")
             lines = [step for line in ended for step in _steps(line.removesuffix(b"\r"))]
-            lines += [*filter(None, begun), rest]
+            lines += _steps(last)
         self.rest = lines.pop()
         if len(data) > self.limit:
             lines = [piece for line in lines for piece in self._cut(line)]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from dora_systemd.decisions.logs.noise import is_same, is_told_by_event, repeated
 from dora_systemd.names import MAX_NAME, MAX_NODE_ID
-from dora_systemd.terminal_text import COLORS, one_line, shown_log
+from dora_systemd.terminal_text import COLOR_BYTES, one_line, shown_log
 
 # The beginning of a line of `journalctl -o short`, with or without journalctl's own colours, or
 # what it prints before the second and later lines of a message.
@@ -85,7 +85,7 @@ class TerminalLines:
         """The lines that `data` completes, rewritten, but for the last record, which may go on."""
         shown = self._whole.feed(data)
         if not self._want_colors:
-            shown = COLORS.sub(b"", shown)
+            shown = COLOR_BYTES.sub(b"", shown)
         before, *parts = _PREFIX.sub(self._rewrite, shown).split(_MARK)
         if self._last:
             self._last[-1] += before

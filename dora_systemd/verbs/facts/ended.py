@@ -87,11 +87,9 @@ def _with_end(manager: Manager, row: DataflowRow, event: LastEvent | None) -> Da
     own = event if is_own else None
     row = row._replace(ended=times["InactiveEnterTimestamp"] or (own.at_us if own else 0))
     if own and own.event == "dataflow-failed":  # a stop that calls its restart off changes nothing
-        row = row._replace(status=FAILED)
+        return row._replace(status=FAILED, text=own.detail)
     if row.status != FAILED:
         return row
-    if own and own.event == "dataflow-failed":
-        return row._replace(text=own.detail)
     return row._replace(text=failure_reason(manager, row.unit))
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.asked import is_stopped
+from dora_systemd.decisions.cell.asked import is_stopped, is_stopping
 from dora_systemd.decisions.cell.counters import (
     WHOLE_CELL,
     CpuSample,
@@ -229,9 +229,8 @@ def _limit(value: int | None) -> int | None:
 def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> NodeRow:
     if status is None:
         return NodeRow(node, "unknown", **numbers)
-    pid = 0 if status.is_held else status.pid
     facts = {
-        "pid": pid,
+        "pid": 0 if status.is_held else status.pid,
         "restarts": status.restarts,
         "max_restarts": status.max_restarts or None,
         "exit": str(status.exit),
@@ -241,5 +240,5 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "machine": status.machine,
         "stopped_by": status.asked_by if is_stopped(status) else "",
     }
-    state = "stopping" if is_stopped(status) and pid else status.state
+    state = "stopping" if is_stopping(status) else status.state
     return NodeRow(node, state, **facts, **numbers)  # type: ignore[arg-type]

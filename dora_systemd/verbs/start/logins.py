@@ -14,6 +14,7 @@ from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import RUNTIME_NAME, Scope
 from dora_systemd.trust.paths import exists
+from dora_systemd.verbs.start.linger import linger_note
 from dora_systemd.verbs.start.plan import Plan
 
 PASSWD = Path("/etc/passwd")
@@ -44,6 +45,11 @@ def has_run_here(scope: Scope) -> bool:
     systemd keeps the parent of RuntimeDirectory= of all dataflows after their end.
     """
     return exists(scope.runtime_root / RUNTIME_NAME)
+
+
+def logout_note(scope: Scope) -> str:
+    """A warning, before the first start, that the dataflow ends at logout; or ""."""
+    return "" if has_run_here(scope) else linger_note(scope)
 
 
 def start_notes(plan: Plan, passwd: Path = PASSWD) -> Iterator[str]:

@@ -217,7 +217,7 @@ def test_a_disk_that_is_full_and_has_room_again(rest: bytes, fifo: Path) -> None
     held.close()
     held.sent_all(1, b"")
     os.close(fd)
-    assert read_held(fifo) == (rest + b"four\n", 0), "who is killed leaves it"
+    assert read_held(fifo) == (rest + b"four\n", 0), "a killed runner leaves its file"
 
 
 def test_a_disk_that_is_full_in_the_middle_of_a_write(fifo: Path) -> None:
