@@ -109,10 +109,17 @@ class Browser:
         self.wait_js(f"{found}?.includes({json.dumps(part)})", seconds)
 
     def click(self, selector: str) -> None:
-        """A click with the mouse in the middle of an element, as soon as it is there."""
+        """A click with the mouse on an element, aimed again where the page moved it meanwhile."""
         self.wait_js(f"document.querySelector({json.dumps(selector)}) !== null")
+        wait_for(f"a click on {selector}", lambda: self._has_hit(selector))
+
+    def _has_hit(self, selector: str) -> bool:
+        """Click in the middle of an element; whether that element got the click."""
         script = (
             f"(() => {{const e = document.querySelector({json.dumps(selector)});"
+            "window.hit = false; window.addEventListener('click', ({ target }) =>"
+            f" {{ window.hit = target.closest({json.dumps(selector)}) !== null }},"
+            " { capture: true, once: true });"
             "e.scrollIntoView({block: 'center'}); const r = e.getBoundingClientRect();"
             "return [r.x + r.width / 2, r.y + r.height / 2]})()"
         )
@@ -120,6 +127,7 @@ class Browser:
         at = {"x": x, "y": y, "button": "left", "clickCount": 1}
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, **at)
+        return bool(self.js("window.hit"))
 
     def point(self, selector: str, share: float) -> None:
         """The pointer over an element, at a share of its width."""

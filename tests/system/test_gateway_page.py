@@ -255,3 +255,25 @@ LAYOUT = """
 def test_no_two_nodes_in_one_place(browser: Browser) -> None:
     """Two hundred graphs, with circles, loops and edges from nowhere."""
     assert browser.js(LAYOUT) == []
+
+
+KEPT = """
+(async () => {
+  const { Graph } = await import("/page/graph.js");
+  const graph = new Graph(() => 0);
+  document.body.append(graph.node);
+  const box = () => graph.node.querySelector("[data-node=a]");
+  const show = (...ids) => graph.show({ nodes: ids.map((id) => ({ id, kind: "python" })) });
+  show("a");
+  const first = box();
+  show("a");
+  const isKept = box() === first;
+  show("a", "b");
+  return [isKept, box() !== first, graph.boxes.size];
+})()
+"""
+
+
+def test_the_same_graph_keeps_its_boxes(browser: Browser) -> None:
+    """Between the two halves of a click a node is not drawn anew."""
+    assert browser.js(KEPT) == [True, True, 2]

@@ -38,6 +38,8 @@ export class Graph {
 
   /** data: a message of the type graph, or null while there is none. */
   show(data) {
+    // What is the same keeps its boxes: a click in the middle of another drawing would be lost.
+    if (this.data && JSON.stringify(data) === JSON.stringify(this.data)) return;
     this.data = data;
     this.shape = "";
     this.#draw();
