@@ -14,11 +14,12 @@ from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.decisions.needs.words import format_wait
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.runner.asked.hand import Hand, Target
+from dora_systemd.runner.asked.hand import Hand
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.cell.role import Alone
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.reloader import Reloader
+from dora_systemd.runner.reload.swap import Target
 from dora_systemd.values import quoted
 
 Answer = dict[str, Any]

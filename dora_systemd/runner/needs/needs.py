@@ -141,8 +141,12 @@ class Needs:
                 if node not in self._run.pump.cell.nodes:
                     return  # a reload has removed it
                 with self._run.nodes.exchanging(node):
-                    await self._run.swapper.hold(self._definition(node))
+                    await self._hold(node)
                 await self._run.nodes.wait_gone(node, old)
+
+    async def _hold(self, node: str) -> None:
+        swapper = self._run.swapper
+        await swapper.hold(swapper.target(self._definition(node), has_readers=True))
 
     @contextlib.contextmanager
     def _until_done(self, node: str) -> Iterator[None]:

@@ -14,6 +14,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.life.view import has_started
+from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.decisions.reload.steps import How, Step
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.nodes.nodes import Nodes
@@ -43,6 +44,15 @@ async def tell_started(run: Run, tell: Callable[[], None]) -> None:
     """Tell the reloader when all nodes run: from then on the run is not a trial any more."""
     if await run.pump.wait(has_started, None):
         tell()
+
+
+def is_read(node: str, options: RunnerOptions, *versions: Prepared) -> bool:
+    """Return whether other nodes, or the watch over owed outputs, have an input from this node.
+
+    versions: of the dataflow; one of them is enough.
+    """
+    is_owing = any(one.node == node for one in options.owes)
+    return is_owing or any(has_readers(node, one.descriptor["nodes"]) for one in versions)
 
 
 class Applier:
@@ -127,8 +137,10 @@ class Applier:
             await swapper.rewire(definition, kind)
         else:
             old = self.run.pump.cell.nodes[step.node]
+            # In the middle of an undo, nodes of both versions can run.
+            is_needed = is_read(step.node, self._options, prepared, self._change.prepared)
             starts_first = self._options.reload.starts_first(step.node)
-            await swapper.swap(definition, kind, starts_first)
+            await swapper.swap(definition, kind, is_needed, starts_first)
             if old.needs:  # two launchers must not go on
                 await self.run.nodes.wait_gone(step.node, old.pid)
 

@@ -20,13 +20,12 @@ from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.decisions.rights.node_rights import essential_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.runner.cell.failure import words
 from dora_systemd.runner.cell.pump import now_us
-from dora_systemd.runner.reload.apply import Applier, Run
+from dora_systemd.runner.reload.apply import Applier, Run, is_read
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.sources import Change, Sources
 from dora_systemd.runner.reload.swap import NotReady, patience
@@ -137,10 +136,9 @@ class Reloader:
         return next(one for one in nodes if one["id"] == node)
 
     def has_readers(self, node: str) -> bool:
-        """Whether other nodes, or the watch over owed outputs, have an input from this node."""
-        nodes = self.current.descriptor["nodes"] if self.current else []
-        is_owing = any(one.node == node for one in self.options.owes)
-        return is_owing or has_readers(node, nodes)
+        """Whether anything has an input from this node of the current version."""
+        versions = [self.current] if self.current else []
+        return is_read(node, self.options, *versions)
 
     def _settle(self, outcome: str) -> None:
         if self._outcome is not None and not self._outcome.done():

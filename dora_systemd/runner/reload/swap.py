@@ -1,21 +1,31 @@
 """Replaces single nodes of a dataflow while it runs.
 
-dora has two requests for this, and neither is enough. RestartNode ends the old process, but starts
-the new one only after the node's restart delay. ReplaceNode starts the new process while the old
-one still runs. The Swapper sends one after the other: RestartNode ends the old process within its
-grace period, and ReplaceNode starts the new one at once. The setting that starts the new process
-first needs only ReplaceNode. Other inputs or outputs need RemoveNode and AddNode.
+dora has no request for this that is enough. RestartNode ends the old process, but counts as a
+restart and starts the new process only after the node's restart delay, and dora refuses it for a
+node that has no restart left. ReplaceNode starts the new process while the old one still runs: on a
+busy machine dora may then deliver no message to the new one. RemoveNode closes the inputs that
+other nodes have from the node, and AddNode does not open them again. So the Swapper sends
+
+    RemoveNode, then AddNode         if nobody reads the node
+    RestartNode, then ReplaceNode    if somebody does: ReplaceNode starts the new process at once
+    ReplaceNode                      if dora would not restart it, or it has no process, or the
+                                     setting says that the new process starts first
+
+AddNode and ReplaceNode begin with all restarts, and wait for no delay. A node with other inputs or
+outputs can only be removed and added.
 
 The Swapper sends requests, and the pump hears of their effect: exits and readiness arrive as
-events of the run. So each method first pushes the event that marks the node as reloading in the
-live table, and only then asks dora. In the other order the old state "running" would satisfy the
-wait for the new process.
+events of the run. So a method that waits for the new process first pushes the event that marks the
+node as reloading in the live table, and only then asks dora. In the other order the old state
+"running" would satisfy the wait for the new process.
 """
 
 import contextlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
+from dora_systemd.decisions.cell.asked import RESTART
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
@@ -32,6 +42,7 @@ _ANSWER_SECONDS = 30.0
 _READY_SECONDS = 30
 _MOST_SECONDS = 600
 _STARTS = 4
+_WITH_PROCESS = ("starting", "ready", "running", "reloading")
 
 
 class NotReady(Exception):
@@ -47,6 +58,36 @@ def patience(cell: Cell) -> int:
     return min(max(_READY_SECONDS, _STARTS * start), _MOST_SECONDS)
 
 
+@dataclass(frozen=True)
+class Target:
+    """A node whose process has to end. status: before that. definition: as dora gets it.
+
+    has_readers: whether anything in the dataflow reads its outputs. grace: µs that the process has
+    to end.
+    """
+
+    node: str
+    status: NodeStatus
+    definition: Mapping[str, Any]
+    has_readers: bool
+    grace: int
+
+    @property
+    def patience(self) -> int:
+        """µs until dora sends SIGTERM: dora's message to stop does not reach a node that starts."""
+        return 0 if self.status.state == "starting" else self.grace
+
+    @property
+    def has_process(self) -> bool:
+        """Whether its program may run. The head of several machines knows no pid of others."""
+        return bool(self.status.pid) or self.status.state in _WITH_PROCESS
+
+    @property
+    def is_removable(self) -> bool:
+        """Whether dora can remove it, and add it again. It would add a node of a machine here."""
+        return not self.has_readers and not self.status.machine
+
+
 class Swapper:
     """Has dora change nodes of the run of `pump`, and waits for the effect."""
 
@@ -54,39 +95,54 @@ class Swapper:
         self._pump = pump
         self._engine = dora
 
-    async def swap(self, definition: Mapping[str, Any], kind: str, starts_first: bool) -> None:
+    def target(self, definition: Mapping[str, Any], has_readers: bool) -> Target:
+        """The node with this definition as it is now, with the grace period of the dataflow."""
+        node, cell = str(definition["id"]), self._pump.cell
+        return Target(node, cell.nodes[node], definition, has_readers, cell.grace)
+
+    async def swap(
+        self, definition: Mapping[str, Any], kind: str, has_readers: bool, starts_first: bool
+    ) -> None:
         """Replace a node that keeps its inputs and outputs. Raises DoraSystemdError and NotReady.
 
         definition: the node as dora gets it. kind: as in the live table. starts_first: whether the
         new process starts while the old one runs.
         """
         node = str(definition["id"])
-        old = self._pump.cell.nodes[node]
+        await self._pump.wait(of_node(node, _is_known), patience(self._pump.cell))
+        target = self.target(definition, has_readers)
         self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
-        if old.pid and not starts_first and not old.needs and is_restartable(old):
-            await self._end(node, "RestartNode")
-        await self.ask(protocol.replace_params(self._run, definition))
+        if starts_first or target.status.needs:  # a launcher that waits reads no messages
+            await self.begin(protocol.replace_params(self._run, definition))
+        else:
+            await self.replace(target)
         await self._wait_ready(node)
 
-    async def hold(self, definition: Mapping[str, Any]) -> None:
-        """End the process of a node, and have the next one wait at its closed gate.
+    async def replace(self, target: Target) -> None:
+        """End the process of a node, and start the next one. Raises DoraSystemdError."""
+        if target.has_process and target.is_removable:
+            await self._end("RemoveNode", target)
+            await self.begin(protocol.add_params(self._run, target.definition))
+        else:
+            await self.hold(target)
+
+    async def hold(self, target: Target) -> None:
+        """End the process of a node that dora keeps; the next one waits if its gate is closed.
 
         Raises DoraSystemdError if dora has given the node up.
         """
-        node = str(definition["id"])
-        old = self._pump.cell.nodes[node]
-        if old.pid and is_restartable(old):
+        if target.has_process and is_restartable(target.status):
             # Dora refuses this for a node that is just being started.
             with contextlib.suppress(DoraSystemdError):
-                await self._end(node, "RestartNode")
-        if self._pump.cell.state is State.RUNNING:  # else a stop has come meanwhile
-            await self.ask(protocol.replace_params(self._run, definition))
+                await self._end("RestartNode", target)
+        await self.begin(protocol.replace_params(self._run, target.definition))
 
     async def rewire(self, definition: Mapping[str, Any], kind: str) -> None:
         """Replace a node whose inputs or outputs change. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
+        target = self.target(definition, has_readers=False)
         self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
-        await self._end(node, "RemoveNode")
+        await self._end("RemoveNode", target)
         await self.ask(protocol.add_params(self._run, definition))
         await self._wait_ready(node)
 
@@ -100,8 +156,9 @@ class Swapper:
 
     async def remove(self, node: str) -> None:
         """Remove a node from the run. Raises DoraSystemdError."""
+        target = self.target({"id": node}, has_readers=False)
         self._pump.push(life.NodeReloading(now_us(), node))
-        await self._end(node, "RemoveNode")
+        await self._end("RemoveNode", target)
         self._pump.push(life.NodeRemoved(now_us(), node))
 
     async def reload_operator(self, node: str, operator: str) -> None:
@@ -118,18 +175,37 @@ class Swapper:
         if reply.error:
             raise DoraSystemdError(f"cannot do that in dora: {protocol.first_line(reply.error)}")
 
-    async def _end(self, node: str, method: str) -> None:
-        grace = self._pump.cell.grace
-        await self.ask(protocol.node_params(method, self._run, node, grace))
-        await self._pump.wait(_of(node, lambda one: not one.pid), stop_timeout(grace) / SECOND)
+    async def begin(self, params: protocol.Params) -> None:
+        """Have dora start a process, unless a stop of the dataflow has come meanwhile."""
+        if self._pump.cell.state is State.RUNNING:
+            await self.ask(params)
+
+    async def _end(self, method: str, target: Target) -> None:
+        await self.ask(protocol.node_params(method, self._run, target.node, target.patience))
+        over = of_node(target.node, _has_ended)
+        await self._pump.wait(over, stop_timeout(target.grace) / SECOND)
 
     async def _wait_ready(self, node: str) -> None:
         seconds = patience(self._pump.cell)
-        await self._pump.wait(_of(node, _is_settled), seconds)
+        await self._pump.wait(of_node(node, _is_settled), seconds)
         state = self._pump.cell.nodes[node]
         if not state.is_alive and not state.needs:
             late = f"not ready within {format_duration(seconds * SECOND)}"
             raise NotReady(f"node {node}: {str(state.exit) or late}")
+
+
+def _is_known(node: NodeStatus) -> bool:
+    """Whether its process is known, if it has one: RemoveNode would else end one unheard of."""
+    return node.state != "starting" or bool(node.pid) or bool(node.machine)
+
+
+def _has_ended(node: NodeStatus) -> bool:
+    """Whether the process has ended that ran when dora was asked to end it.
+
+    A restart that somebody asked for can concern another machine, whose pids are not known here.
+    """
+    is_asked = node.asked == RESTART and node.state != "waiting"
+    return node.state != "reloading" if is_asked else not node.pid
 
 
 def _is_settled(node: NodeStatus) -> bool:
@@ -147,5 +223,6 @@ def _status(definition: Mapping[str, Any], kind: str) -> NodeStatus:
     return initial_nodes({node: kind}, {"nodes": [definition]}, now_us())[node]
 
 
-def _of(node: str, is_so: Callable[[NodeStatus], bool]) -> Callable[[Cell], bool]:
+def of_node(node: str, is_so: Callable[[NodeStatus], bool]) -> Callable[[Cell], bool]:
+    """Return whether `is_so` holds for a node, or the node is gone, as a condition of the cell."""
     return lambda cell: node not in cell.nodes or is_so(cell.nodes[node])

@@ -7,7 +7,7 @@ from typing import Any
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.reload.steps import How, Step
@@ -22,6 +22,22 @@ from dora_systemd.values import SECOND
 from tests.unit.fakes.run import Calls, FakeDora, FakeNodes, FakePipes
 
 RUNNING = NodeStatus("running", 7, policy="on-failure")
+_SPENT = RUNNING._replace(restarts=2, max_restarts=2)
+_NEVER = RUNNING._replace(policy="never")
+_BACKOFF = RUNNING._replace(state="restarting", pid=0)
+_HELD = RUNNING._replace(state="failed", pid=0, policy=HELD)
+_ADDED, _RESTARTED, _REPLACED = (
+    ["RemoveNode", "AddNode"],
+    ["RestartNode", "ReplaceNode"],
+    ["ReplaceNode"],
+)
+EXCHANGES = [
+    *((False, one, _ADDED) for one in (RUNNING, _SPENT, _NEVER)),
+    *((False, one, _REPLACED) for one in (_BACKOFF, _HELD)),
+    (True, RUNNING, _RESTARTED),
+    *((True, one, _REPLACED) for one in (_SPENT, _NEVER, _BACKOFF, _HELD)),
+]
+"""Whether somebody reads a node, how it is, and what dora is asked in order to replace it."""
 
 
 class ReloadBench:
@@ -49,11 +65,12 @@ class ReloadBench:
         self.options = RunnerOptions("robot", "uuid", str(self.flow), str(root), "/bin/true")
         self.prepared = self.write("abc")
 
-    def write(self, nodes: str) -> Prepared:
-        """Save a dataflow of these nodes; each has a program of its own."""
+    def write(self, nodes: str, reader: str = "") -> Prepared:
+        """Save a dataflow of these nodes; each has a program of its own. reader: reads node a."""
         for one in nodes:
             (self.root / f"{one}.py").touch()
-        lines = [f"  - {{id: {one}, path: {one}.py}}\n" for one in nodes]
+        edges = {"a": ", outputs: [o]", reader: ", inputs: {i: a/o}"} if reader else {}
+        lines = [f"  - {{id: {one}, path: {one}.py{edges.get(one, '')}}}\n" for one in nodes]
         self.flow.write_text("nodes:\n" + "".join(lines))
         return prepare(self.options, {})
 

@@ -9,7 +9,7 @@ import pytest
 
 from dora_systemd.adapters.dora.preparation import prepare
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
+from dora_systemd.decisions.cell.status import LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -22,7 +22,7 @@ from dora_systemd.runner.nodes.gate import Gates
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.values import SECOND
-from tests.unit.fakes.reload import ReloadBench
+from tests.unit.fakes.reload import EXCHANGES, ReloadBench
 
 RUNNING = NodeStatus("running", 7, policy="on-failure", max_restarts=2)
 BACKOFF = RUNNING._replace(state="restarting", pid=0, restarts=1)
@@ -84,24 +84,18 @@ def run(root: Path, scene: Callable[[AskedBench], Awaitable[None]], **more: Any)
     return asyncio.run(work())
 
 
-RESTARTS = [
-    ("c", RUNNING, ["RemoveNode", "AddNode"]),
-    ("c", SPENT, ["RemoveNode", "AddNode"]),
-    ("c", NEVER, ["RemoveNode", "AddNode"]),
-    ("c", BACKOFF, ["ReplaceNode"]),
-    ("a", RUNNING, ["RestartNode", "ReplaceNode"]),
-    ("a", SPENT, ["ReplaceNode"]),
-    ("a", NEVER, ["ReplaceNode"]),
-    ("a", BACKOFF, ["ReplaceNode"]),
-    ("a", RUNNING._replace(state="failed", pid=0, policy=HELD), ["ReplaceNode"]),
-    ("a", RUNNING._replace(state="failed", pid=0, policy=LATCHED), ["ReplaceNode"]),
-]
+LATCHED_ONE = RUNNING._replace(state="failed", pid=0, policy=LATCHED)
 
 
-@pytest.mark.parametrize(("node", "before", "methods"), RESTARTS)
+@pytest.mark.parametrize(
+    ("is_read", "before", "methods"), [*EXCHANGES, (True, LATCHED_ONE, ["ReplaceNode"])]
+)
 def test_a_restart_begins_at_once_with_all_restarts(
-    tmp_path: Path, node: str, before: NodeStatus, methods: list[str]
+    tmp_path: Path, is_read: bool, before: NodeStatus, methods: list[str]
 ) -> None:
+    """A reload does the same, see test_apply.py."""
+    node = "a" if is_read else "c"
+
     async def scene(bench: AskedBench) -> None:
         assert await bench.ask("restart", node) == f"Node restarting: {node}"
 

@@ -8,18 +8,21 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.decisions.cell.hot_reload import START_FIRST, HotReload
+from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.reload.steps import How
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.reload.swap import NotReady
 from dora_systemd.values import SECOND
 from tests.unit.fakes.loop import live
-from tests.unit.fakes.reload import RUNNING
+from tests.unit.fakes.reload import EXCHANGES, RUNNING
 from tests.unit.fakes.reload import ReloadBench as Bench
 
 STEPS = [
-    (How.SWAP, "a", [("RestartNode", "a"), ("ReplaceNode", "a")]),
+    (How.SWAP, "a", [("RemoveNode", "a"), ("AddNode", "a")]),
     (How.REWIRE, "a", [("RemoveNode", "a"), ("AddNode", "a")]),
     (How.REMOVE, "a", [("RemoveNode", "a")]),
     (How.ADD, "c", [("AddNode", "c")]),
@@ -75,19 +78,83 @@ def test_the_room_of_a_node_goes_when_it_has_ended(tmp_path: Path) -> None:
     live(work)
 
 
-@pytest.mark.parametrize(
-    "old",
-    [
-        NodeStatus("running", 7, policy="never"),
-        NodeStatus("running", 7, policy="always", restarts=3, max_restarts=3),
-        NodeStatus("failed", 0, policy=HELD),
-    ],
-)
-def test_what_dora_would_not_start_again_is_replaced_only(tmp_path: Path, old: NodeStatus) -> None:
+@pytest.mark.parametrize(("is_read", "old", "methods"), EXCHANGES)
+def test_a_node_is_replaced_as_by_hand(
+    tmp_path: Path, is_read: bool, old: NodeStatus, methods: list[str]
+) -> None:
+    """See test_asked.py for a restart by hand."""
+
     async def work() -> None:
         bench = Bench(tmp_path, a=old)
+        bench.prepared = bench.write("ab", reader="b" if is_read else "")
+        await bench.applier((How.SWAP, "a")).apply()
+        assert bench.asked == [(method, "a") for method in methods]
+
+    live(work)
+
+
+@pytest.mark.parametrize(
+    ("old", "options"),
+    [
+        (RUNNING, {"reload": HotReload(replace=(("a", START_FIRST),))}),
+        (RUNNING._replace(policy="never"), {"reload": HotReload(replace=(("", START_FIRST),))}),
+        (RUNNING._replace(state="waiting", needs="/dev/cam"), {}),
+    ],
+    ids=["start first", "start first without restarts", "it waits"],
+)
+def test_the_old_process_is_not_ended_first(
+    tmp_path: Path, old: NodeStatus, options: dict[str, Any]
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, a=old)
+        bench.options = bench.options._replace(**options)
         await bench.applier((How.SWAP, "a")).apply()
         assert bench.asked == [("ReplaceNode", "a")]
+
+    live(work)
+
+
+def test_a_node_that_owes_an_output_is_not_removed(tmp_path: Path) -> None:
+    """The watch over this output reads it, and would hear nothing any more."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.options = bench.options._replace(owes=(Owed("a", "o", SECOND, SECOND, "warn"),))
+        await bench.applier((How.SWAP, "a")).apply()
+        assert bench.asked == [("RestartNode", "a"), ("ReplaceNode", "a")]
+
+    live(work)
+
+
+@pytest.mark.parametrize("reader", ["", "b"])
+def test_the_way_back_does_not_remove_what_the_new_version_reads(
+    tmp_path: Path, reader: str
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        before = bench.prepared
+        bench.prepared = bench.write("ab", reader)
+        applier = bench.applier((How.SWAP, "a"))
+        await applier.apply()
+        bench.calls.clear()
+        await applier.undo(before)
+        assert ("RemoveNode", "a") not in bench.asked or not reader
+        assert bench.asked[-1] == ("ReplaceNode" if reader else "AddNode", "a")
+
+    live(work)
+
+
+def test_a_process_that_dora_is_just_starting_is_known_before_it_is_ended(tmp_path: Path) -> None:
+    """As after a restart by hand, which does not wait for it."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path, a=RUNNING._replace(state="starting", pid=0))
+        task = asyncio.create_task(bench.applier((How.SWAP, "a")).apply())
+        await asyncio.sleep(1)
+        assert not bench.asked
+        bench.pump.push(life.NodeSpawned(1, "a", 6))
+        await task
+        assert bench.asked == [("RemoveNode", "a"), ("AddNode", "a")]
 
     live(work)
 
@@ -111,7 +178,7 @@ def test_an_operator_reads_its_file_again(tmp_path: Path) -> None:
 def test_a_node_that_does_not_get_ready(tmp_path: Path, then: str, words: str) -> None:
     async def work() -> None:
         bench = Bench(tmp_path)
-        bench.dora.then["ReplaceNode"] = bench.crash if then == "crash" else lambda: None
+        bench.dora.then["AddNode"] = bench.crash if then == "crash" else lambda: None
         applier = bench.applier((How.SWAP, "a"), (How.SWAP, "b"))
         began = asyncio.get_running_loop().time()
         with pytest.raises(NotReady) as caught:
@@ -134,7 +201,7 @@ def test_a_slow_start_gives_a_new_version_more_time(
     async def work() -> None:
         bench = Bench(tmp_path)
         bench.pump.cell = replace(bench.pump.cell, ready_us=round(start * SECOND))
-        bench.dora.then["ReplaceNode"] = lambda: None
+        bench.dora.then["AddNode"] = lambda: None
         began = asyncio.get_running_loop().time()
         with pytest.raises(NotReady):
             await bench.applier((How.SWAP, "a")).apply()
@@ -157,7 +224,7 @@ def test_the_way_back_begins_with_the_last_step(tmp_path: Path) -> None:
     async def work() -> None:
         bench = Bench(tmp_path)
         applier = bench.applier((How.REMOVE, "a"), (How.SWAP, "b"), (How.ADD, "c"))
-        bench.dora.then["AddNode"] = bench.crash
+        bench.dora.then["AddNode"] = lambda: bench.crash() if bench.node == "c" else bench.spawn()
         with pytest.raises(NotReady):
             await applier.apply()
         bench.calls.clear()
@@ -165,7 +232,7 @@ def test_the_way_back_begins_with_the_last_step(tmp_path: Path) -> None:
         await applier.undo(bench.prepared)
         assert bench.asked == [
             ("RemoveNode", "c"),
-            ("ReplaceNode", "b"),
+            *(("RemoveNode", "b"), ("AddNode", "b")),
             ("AddNode", "a"),
         ]
         assert bench.states() == {"a": "running", "b": "running"}
@@ -177,7 +244,7 @@ def test_the_way_back_goes_on_over_a_node_that_is_not_ready(tmp_path: Path) -> N
     async def work() -> None:
         bench = Bench(tmp_path)
         applier = bench.applier((How.REMOVE, "a"), (How.SWAP, "b"))
-        bench.dora.then["ReplaceNode"] = bench.crash
+        bench.dora.then["AddNode"] = bench.crash
         with pytest.raises(NotReady):
             await applier.apply()
         await applier.undo(bench.prepared)
@@ -217,7 +284,7 @@ def test_the_descriptor_that_is_sent_is_the_new_one(tmp_path: Path) -> None:
 def _sent(bench: Bench) -> Any:
     params = bench.dora.asked[-1]
     assert not isinstance(params, str)
-    return params["ReplaceNode"]["node"]
+    return params["AddNode"]["node"]
 
 
 def _definition(prepared: Prepared, node: str) -> Any:

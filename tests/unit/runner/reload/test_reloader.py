@@ -44,7 +44,7 @@ class Bench(ReloadBench):
 
     @property
     def reloaded(self) -> list[str]:
-        return [node for method, node in self.asked if method == "ReplaceNode"]
+        return [node for method, node in self.asked if method == "RemoveNode"]
 
 
 async def until(is_so: Callable[[], object]) -> None:
@@ -60,14 +60,14 @@ def test_a_save_while_a_reload_is_under_way_is_not_lost(tmp_path: Path) -> None:
     async def work() -> None:
         bench = Bench(tmp_path)
         bench.begin()
-        bench.dora.then["ReplaceNode"] = lambda: None  # a is not ready yet
+        bench.dora.then["AddNode"] = lambda: None  # a is not ready yet
         task = asyncio.create_task(bench.reloader.work())
         bench.see("a.py")
         await until(lambda: bench.reloaded == ["a"])
         bench.see("b.py")
         await asyncio.sleep(0)
         assert bench.reloaded == ["a"], "one after the other"
-        bench.dora.then["ReplaceNode"] = bench.spawn
+        bench.dora.then["AddNode"] = bench.spawn
         bench.spawn()
         await until(lambda: bench.reloaded == ["a", "b"])
         await until(lambda: len(bench.pipes.reasons("node-reloaded")) == 2)
@@ -105,13 +105,13 @@ def test_two_reloads_by_hand_follow_each_other(tmp_path: Path) -> None:
     async def work() -> None:
         bench = Bench(tmp_path)
         bench.begin()
-        bench.dora.then["ReplaceNode"] = lambda: None
+        bench.dora.then["AddNode"] = lambda: None
         first, second = (asyncio.create_task(bench.by_hand(node)) for node in "ab")
         await until(lambda: bench.reloaded)
         for _ in range(20):
             await asyncio.sleep(0.001)
         assert bench.reloaded == ["a"]
-        bench.dora.then["ReplaceNode"] = bench.spawn
+        bench.dora.then["AddNode"] = bench.spawn
         bench.spawn()
         await asyncio.gather(first, second)
         assert bench.reloaded == ["a", "b"]
@@ -421,7 +421,7 @@ def test_a_program_that_does_not_start_has_no_version_before(tmp_path: Path) -> 
     async def work() -> None:
         bench = Bench(tmp_path)
         bench.begin()
-        bench.dora.then["ReplaceNode"] = bench.crash
+        bench.dora.then["AddNode"] = bench.crash
         with pytest.raises(DoraSystemdError, match=r"^cannot use what was saved: node a"):
             await bench.by_hand("a")
         assert bench.reloaded == ["a"]
