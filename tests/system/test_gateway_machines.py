@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 
 from dora_systemd.decisions.resources.usage import Strain, Usage
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed, observed_values
 from dora_systemd.values import SECOND
 from tests.system.chromium import Browser

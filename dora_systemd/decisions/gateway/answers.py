@@ -18,7 +18,8 @@ from dora_systemd.decisions.logs.records import (
     timestamp,
 )
 from dora_systemd.decisions.views.dataflows import FAILED, UP_WORDS
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.values import SECOND
 
 _MEGABYTE = 1_000_000

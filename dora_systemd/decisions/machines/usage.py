@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.counters import CpuSample, cpu_percent, throttled_percent
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.resources.usage import Usage
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.decisions.resources.usage import Usage, usage_facts
+from dora_systemd.values import INFINITY
 
 _MOST = INFINITY // 2
 _MOST_PERCENT = 100 * 8192
@@ -28,15 +28,7 @@ class NodeUse(NamedTuple):
 
     def facts(self) -> dict[str, Any]:
         """The fields of a NodeRow."""
-        share = self.use.cpu_max
-        return {
-            "cpu_percent": self.cpu_percent,
-            "cpu_limit": None if share is None else 100 * share / SECOND,
-            "throttled": None if share is None else self.throttled,
-            "memory": self.use.memory,
-            "memory_peak": self.use.memory_peak,
-            "memory_limit": self.use.memory_max,
-        }
+        return usage_facts(self.use, self.cpu_percent, self.throttled)
 
 
 def told_use(use: Usage, samples: tuple[CpuSample, ...], now: CpuSample, node: str) -> list[Any]:

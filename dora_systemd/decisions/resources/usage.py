@@ -1,7 +1,9 @@
 """Resource usage and waiting times of a cgroup. Pure."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from dora_systemd.values import INFINITY, SECOND
 
 RESOURCES = ("cpu", "memory", "io")
 WORTH_SHOWING = 1.0
@@ -34,6 +36,24 @@ class Strain(NamedTuple):
     stalled: Mapping[str, tuple[int, int]] = {}
     throttled: int = 0
     oom_kills: int = 0
+
+
+def limit_of(value: int | None) -> int | None:
+    """A limit of Usage, None without one."""
+    return None if value == INFINITY else value
+
+
+def usage_facts(use: Usage, cpu_percent: float | None, throttled: float | None) -> dict[str, Any]:
+    """The fields of a row. throttled: percentage of the time, for a group with a CPU limit."""
+    share = limit_of(use.cpu_max)
+    return {
+        "cpu_percent": cpu_percent,
+        "cpu_limit": None if share is None else 100 * share / SECOND,
+        "throttled": None if share is None else throttled,
+        "memory": use.memory,
+        "memory_peak": use.memory_peak,
+        "memory_limit": limit_of(use.memory_max),
+    }
 
 
 def waits(before: Strain, now: Strain, window: int) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.signs.messages import MAX_STATUS
-from dora_systemd.values import INFINITY, SECOND, format_duration
+from dora_systemd.values import INFINITY
 
 
 class Sign(NamedTuple):
@@ -37,11 +37,3 @@ def sign_facts(sign: Sign, now_us: int) -> dict[str, Any]:
         "watchdog": sign.watchdog or None,
         "sign_age": max(now_us - sign.at_us, 0) if sign.at_us else None,
     }
-
-
-def format_watchdog(age: int | None, limit: int | None) -> str:
-    """As in "1.2s/5s": the age of the last sign, and the watchdog; "" without any."""
-    if age is None and limit is None:
-        return ""
-    known = "-" if age is None else f"{age / SECOND:.1f}s"
-    return known if limit is None else f"{known}/{format_duration(limit)}"

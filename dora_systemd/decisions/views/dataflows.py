@@ -1,12 +1,19 @@
 """The table of `doractl list`, from facts of systemd and the runner."""
 
-import time
 from collections.abc import Sequence
 
 from dora_systemd.decisions.needs.words import format_wait
-from dora_systemd.decisions.views.rows import SILENT, DataflowRow, NodeRow
+from dora_systemd.decisions.views.facts import SILENT
+from dora_systemd.decisions.views.formats import (
+    UNKNOWN,
+    format_count,
+    format_memory,
+    format_percent,
+    format_uptime,
+    local_time,
+)
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.terminal_text import cut, one_line
-from dora_systemd.values import SECOND, format_rounded_size
 
 STARTING, WAITING, RUNNING, DEGRADED = "Starting", "Waiting", "Running", "Degraded"
 STOPPING, RESTARTING = "Stopping", "Restarting"
@@ -30,7 +37,6 @@ _BY_ACTIVE = {
 _ALIVE = ("activating", "active", "reloading", "refreshing")
 _BY_STAGE = {"degraded": DEGRADED, "unmet": WAITING, "stopping": STOPPING}
 
-UNKNOWN = "-"
 UNREADABLE = "?"
 """For the nodes of a dataflow whose node table is not valid."""
 SHORTEST_PREFIX = 8
@@ -51,39 +57,6 @@ def status_word(active: str, sub: str, stage: str = "", is_held: bool = False) -
         return WAITING
     word = _BY_ACTIVE.get(active, STOPPED)
     return _BY_STAGE.get(stage, word) if word == RUNNING else word
-
-
-def format_uptime(duration: int | None) -> str:
-    """`duration` µs as "00:05:32", from one day on with "1d " in front."""
-    if duration is None:
-        return UNKNOWN
-    minutes, seconds = divmod(duration // SECOND, 60)
-    hours, minutes = divmod(minutes, 60)
-    days, hours = divmod(hours, 24)
-    clock = f"{hours:02}:{minutes:02}:{seconds:02}"
-    return f"{days}d {clock}" if days else clock
-
-
-def format_percent(percent: float | None) -> str:
-    """One decimal, as in "12.5"."""
-    return UNKNOWN if percent is None else f"{percent:.1f}"
-
-
-def format_cpu(row: DataflowRow | NodeRow) -> str:
-    """Percent of one processor, as in "12.5", or "12.5/50" with a limit."""
-    text = format_percent(row.cpu_percent)
-    return text if row.cpu_limit is None else f"{text}/{row.cpu_limit:g}"
-
-
-def format_memory(size: int | None, limit: int | None = None) -> str:
-    """Bytes for a table, as in "256M", or "256M/4G" with a limit."""
-    text = UNKNOWN if size is None else format_rounded_size(size)
-    return text if limit is None else f"{text}/{format_rounded_size(limit)}"
-
-
-def format_count(count: int | None) -> str:
-    """A number, or the sign for unknown."""
-    return UNKNOWN if count is None else str(count)
 
 
 def shortest_prefixes(uuids: Sequence[str]) -> dict[str, str]:
@@ -213,7 +186,7 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> dict[str, str]:
         "STATUS": row.status,
         "UPTIME": format_uptime(row.uptime),
         "NODES": node_count(row) or UNKNOWN,
-        "CPU%": format_cpu(row),
+        "CPU%": format_percent(row.cpu_percent, row.cpu_limit),
         "MEM": format_memory(row.memory, row.memory_limit),
         "RESTARTS": format_count(row.restarts),
         "BOOT": "yes" if row.enabled else UNKNOWN,
@@ -242,19 +215,6 @@ def node_count(row: DataflowRow) -> str:
     if row.problem:
         return UNREADABLE
     return f"{row.nodes_alive}/{row.nodes_total}" if row.nodes_total else ""
-
-
-def local_time(moment: int, form: str = "%Y-%m-%d %H:%M:%S") -> str:
-    """CLOCK_REALTIME µs as "2026-01-15 13:00:00" in the local time zone; 0 is unknown.
-
-    form: as for strftime(3).
-    """
-    return time.strftime(form, time.localtime(moment / SECOND)) if moment else UNKNOWN
-
-
-def zoned_time(moment: int) -> str:
-    """As local_time(), with the name of the zone behind it."""
-    return local_time(moment, "%Y-%m-%d %H:%M:%S %Z")
 
 
 def is_up_word(row: DataflowRow) -> bool:

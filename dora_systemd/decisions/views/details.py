@@ -1,72 +1,28 @@
 """Formats one dataflow and its nodes for `doractl list SELECTOR`."""
 
-from collections.abc import Sequence
-
 from dora_systemd.decisions.cell.asked import format_stopped
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
-from dora_systemd.decisions.signs.table import format_watchdog
 from dora_systemd.decisions.views.dataflows import (
     DEGRADED,
     FAILED,
     RESTARTING,
-    UNKNOWN,
     colored_state,
+    format_table,
+    is_up_word,
+)
+from dora_systemd.decisions.views.facts import node_table
+from dora_systemd.decisions.views.formats import (
+    UNKNOWN,
     format_count,
-    format_cpu,
     format_memory,
     format_percent,
-    format_table,
     format_uptime,
-    is_up_word,
     zoned_time,
 )
 from dora_systemd.decisions.views.inhibitors import format_holders
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.terminal_text import cut, one_line
-
-
-def _format_nodes(rows: Sequence[NodeRow], width: int | None, want_colors: bool) -> str:
-    """The node table; with THROTTLED% if any node has a CPU limit, and with what nodes say.
-
-    With MACHINE if any runs on another one.
-    """
-    cells = [_node_cells(row) for row in rows]
-    is_limited = any(row.cpu_limit is not None for row in rows)
-    idle = {title for title in _SIGNS if not any(row[title] for row in cells)}
-    idle |= set() if is_limited else {_THROTTLED}
-    idle |= set() if any(row.machine for row in rows) else {_MACHINE}
-    header = [title for title in cells[0] if title not in idle]
-    lines = [[row[title] for title in header] for row in cells]
-    return format_table(header, lines, width, want_colors)
-
-
-_THROTTLED = "THROTTLED%"
-_MACHINE = "MACHINE"
-_SIGNS = ("WATCHDOG", "STATUS TEXT")
-
-
-def _node_cells(row: NodeRow) -> dict[str, str]:
-    return {
-        "NODE": row.node,
-        _MACHINE: row.machine or HEAD,
-        "STATE": row.word,
-        "PID": str(row.pid) if row.pid else UNKNOWN,
-        "CPU%": format_cpu(row),
-        _THROTTLED: format_percent(row.throttled),
-        "MEM": format_memory(row.memory, row.memory_limit),
-        "PEAK": format_memory(row.memory_peak),
-        "RESTARTS": _restarts_of(row),
-        "EXIT": row.exit or UNKNOWN,
-        "WATCHDOG": format_watchdog(row.sign_age, row.watchdog),
-        "STATUS TEXT": row.text,
-    }
-
-
-def _restarts_of(row: NodeRow) -> str:
-    used = format_count(row.restarts)
-    return f"{used}/{row.max_restarts}" if row.max_restarts else used
-
 
 _WITH_REASON = (FAILED, DEGRADED, RESTARTING)
 
@@ -104,7 +60,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         lines = [colored_state(one, row.status) if one[:7] == "Status:" else one for one in lines]
     if not row.nodes:
         return "\n".join(lines)
-    return "\n".join([*lines, "", _format_nodes(row.nodes, width, want_colors)])
+    return "\n".join([*lines, "", format_table(*node_table(row.nodes), width, want_colors)])
 
 
 def _restart_words(row: DataflowRow) -> str:

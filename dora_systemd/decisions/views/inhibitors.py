@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table
+from dora_systemd.decisions.views.dataflows import format_table
+from dora_systemd.decisions.views.formats import UNKNOWN
 from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.terminal_text import cut, short_line
 

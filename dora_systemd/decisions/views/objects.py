@@ -11,8 +11,9 @@ from typing import Any
 from dora_systemd.decisions.cell.counters import WHOLE_CELL
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.releases.past import Switch
+from dora_systemd.decisions.views.facts import NODE_FACTS, USAGE, NodeRow
 from dora_systemd.decisions.views.inhibitors import holder_object
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import format_moment
 
@@ -80,7 +81,8 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
         **moment("ended", row.ended),
         "nodes_alive": row.nodes_alive if is_counted else None,
         "nodes_total": row.nodes_total if is_counted else None,
-        **_usage(row, shares.get(WHOLE_CELL)),
+        **{one.key: one.of(row) for one in USAGE},
+        "waits_percent": shares.get(WHOLE_CELL) or None,
         "restarts": row.restarts,
         "restart_budget": row.restart_budget,
         "machine": row.machine or None,
@@ -90,42 +92,12 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
 
 
 def _node_object(whole: DataflowRow, row: NodeRow, shares: Shares | None) -> dict[str, Any]:
-    return {
-        "node": row.node,
-        "machine": row.machine or (HEAD if whole.machines else None),
-        "state": row.state,
-        "pid": row.pid or None,
-        "exit": row.exit or None,
-        "waits_for": row.needs or None,
-        "stopped_by": row.stopped_by or None,
-        **moment("since", row.since),
-        "text": row.text or None,
-        "watchdog_us": row.watchdog,
-        "watchdog_age_us": row.sign_age,
-        **_usage(row, shares),
-        "restarts": row.restarts,
-        "max_restarts": row.max_restarts,
-        "essential": row.essential,
-        "scheduling": row.scheduling or None,
-        "cpus": row.cpus or None,
-        "silent": row.silent or None,
-        "outputs": [
-            {"output": one.output, "age_us": one.age, "within_us": one.within, "then": one.then}
-            for one in row.outputs
-        ],
-    }
-
-
-def _usage(row: DataflowRow | NodeRow, shares: Shares | None) -> dict[str, Any]:
-    return {
-        "cpu_percent": row.cpu_percent,
-        "cpu_limit_percent": row.cpu_limit,
-        "throttled_percent": row.throttled,
-        "memory_bytes": row.memory,
-        "memory_peak_bytes": row.memory_peak,
-        "memory_limit_bytes": row.memory_limit,
-        "waits_percent": shares or None,
-    }
+    values: dict[str, Any] = {}
+    for fact in NODE_FACTS:
+        value = fact.value(fact.of(row))
+        values |= moment(fact.key, value) if fact.is_moment else {fact.key: value}
+    machine = row.machine or (HEAD if whole.machines else None)
+    return {**values, "machine": machine, "waits_percent": shares or None}
 
 
 def error_object(error: DoraSystemdError) -> dict[str, Any]:

@@ -3,24 +3,29 @@
 https://prometheus.io/docs/instrumenting/exposition_formats and .../docs/practices/naming
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from dora_systemd.decisions.cell.counters import WHOLE_CELL
-from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, NODE_STATES
-from dora_systemd.decisions.resources.usage import Strain, Usage
+from dora_systemd.decisions.cell.status import NODE_STATES
+from dora_systemd.decisions.resources.usage import Strain, Usage, limit_of
 from dora_systemd.decisions.views.dataflows import FAILED, STOPPED, UP_WORDS
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.facts import (
+    NODE_FACTS,
+    UNKNOWN_STATE,
+    Labels,
+    NodeRow,
+    Sample,
+    node_labels,
+    node_samples,
+)
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.values import SECOND
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 STATES = tuple(sorted(word.lower() for word in (*UP_WORDS, STOPPED, FAILED)))
-UNKNOWN_STATE = "unknown"
-
-Labels = Mapping[str, str]
-Sample = tuple[Labels, float | int]
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,7 @@ GROUP_FAMILIES = (
     Family(
         "memory_peak_bytes", "Peak memory used since its start.", lambda use, _: use.memory_peak
     ),
-    Family("memory_limit_bytes", "Memory limit.", lambda use, _: _limit(use.memory_max)),
+    Family("memory_limit_bytes", "Memory limit.", lambda use, _: limit_of(use.memory_max)),
     Family(
         "oom_kills_total",
         "Processes killed by the kernel, out of memory.",
@@ -73,11 +78,6 @@ PRESSURE = Family(
 STATE = Family("state", "1 for the current state, 0 for all others.")
 RESTARTS = Family("restarts_total", "Automatic restarts; those that somebody asked for are none.")
 READY = Family("ready_time_seconds", "When all nodes were ready, in Unix time.")
-NODE_READY = Family("ready_time_seconds", "When it became ready, in Unix time.")
-WATCHDOG = Family("watchdog_seconds", "Time in which it must send WATCHDOG=1.")
-SIGN_AGE = Family("watchdog_age_seconds", "Time since its last WATCHDOG=1.")
-SILENT = Family("silent", "1 while an output that it owes is missing.")
-LAST_OUTPUT = Family("last_output_age_seconds", "Time since the last message of an owed output.")
 INFO = Family("info", "UUID, unit and release of a dataflow; the value is always 1.")
 RIGHTS = Family("info", "What it is, its scheduling and CPUs; the value is always 1.")
 NODES = Family("nodes", "Nodes that the dataflow has.")
@@ -125,18 +125,15 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
         for one in observed
         for node in one.row.nodes
     ]
-    yield RIGHTS, [({**own, **_rights(n)}, 1) for own, _, n in places if _rights(n)]
+    yield RIGHTS, [({**own, **node_labels(n)}, 1) for own, _, n in places if node_labels(n)]
     states = (*NODE_STATES, UNKNOWN_STATE)
     yield STATE, [sample for own, _, node in places for sample in _states(own, node.state, states)]
     restarts = [(own, node.restarts) for own, _, node in places]
     yield RESTARTS, [(own, count) for own, count in restarts if count is not None]
-    yield NODE_READY, [(own, node.since / SECOND) for own, _, node in places if _is_there(node)]
-    yield WATCHDOG, [(own, n.watchdog / SECOND) for own, _, n in places if n.watchdog]
-    ages = [(own, node.sign_age) for own, _, node in places]
-    yield SIGN_AGE, [(own, age / SECOND) for own, age in ages if age is not None]
-    owing = [(own, node) for own, _, node in places if node.outputs]
-    yield SILENT, [(own, int(bool(node.silent))) for own, node in owing]
-    yield LAST_OUTPUT, [sample for own, node in owing for sample in _ages(own, node)]
+    for fact in (one for one in NODE_FACTS if one.metric):
+        found = [(own, node_samples(fact, node)) for own, _, node in places]
+        samples: list[Sample] = [({**own, **more}, v) for own, some in found for more, v in some]
+        yield Family(fact.metric, fact.help), samples
     counts = [(own, o.lines[node.node]) for own, o, node in places if node.node in o.lines]
     yield LINES, [(own, count.written) for own, count in counts]
     yield SUPPRESSED, [(own, count.suppressed) for own, count in counts]
@@ -146,23 +143,6 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
 def _place(node: NodeRow) -> Labels:
     """Where it runs, unless that is here."""
     return {"machine": node.machine} if node.machine else {}
-
-
-def _ages(own: Labels, node: NodeRow) -> Iterator[Sample]:
-    for one in node.outputs:
-        if one.age is not None:
-            yield {**own, "output": one.output}, one.age / SECOND
-
-
-def _rights(node: NodeRow) -> Labels:
-    """What is special about a node; most have nothing."""
-    essential = {"essential": "yes"} if node.essential else {}
-    named = {"scheduling": node.scheduling, "cpus": node.cpus}
-    return essential | {key: text for key, text in named.items() if text}
-
-
-def _is_there(node: NodeRow) -> bool:
-    return node.state in ALIVE_NODE_STATES and node.since > 0
 
 
 def _states(own: Labels, state: str, states: Iterable[str]) -> Iterator[Sample]:
@@ -190,12 +170,8 @@ def _pressure(own: Labels, strain: Strain) -> Iterator[Sample]:
 
 
 def _cores(use: Usage) -> float | None:
-    share = _limit(use.cpu_max)
+    share = limit_of(use.cpu_max)
     return None if share is None else share / SECOND
-
-
-def _limit(value: int | None) -> int | None:
-    return None if value == INFINITY else value
 
 
 def _format(family: Family, prefix: str, samples: Iterable[Sample]) -> Iterator[str]:

@@ -8,7 +8,8 @@ from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, Switch
 from dora_systemd.decisions.releases.progress import COPY, SOAK, Step
 from dora_systemd.decisions.releases.versions import PROGRAMS
-from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table, local_time
+from dora_systemd.decisions.views.dataflows import format_table
+from dora_systemd.decisions.views.formats import UNKNOWN, local_time
 from dora_systemd.decisions.views.objects import moment
 from dora_systemd.values import format_rounded_size
 

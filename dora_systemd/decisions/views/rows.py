@@ -1,68 +1,10 @@
-"""The rows of `doractl list`: facts of dataflows, their nodes and outputs."""
+"""The rows of `doractl list`: facts of dataflows."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.names import release_of
-
-SILENT = "Silent"
-"""A node that runs, and sends no output that it owes."""
-
-
-class OutputRow(NamedTuple):
-    """An output that a node owes. within: µs. age: µs since its last message, None: none yet.
-
-    then: one of dora_systemd.decisions.cell.owed.THEN.
-    """
-
-    output: str
-    within: int
-    then: str
-    age: int | None = None
-
-
-class NodeRow(NamedTuple):
-    """One row of `list SELECTOR`. Sizes in bytes, cpu in percent of one processor, None: unknown.
-
-    cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
-    which its CPU limit throttled it, None without one. since: time of its last change of state,
-    CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
-    must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
-    the dataflow. scheduling: as in the settings, or "". cpus: those that it may use, "" if the
-    settings name none. silent: what is missing of the outputs that it owes, or "". needs: what it
-    waits for, or "". machine: the other machine that it runs on, or "". stopped_by: who has asked
-    for a stop of the node alone, or "".
-    """
-
-    node: str
-    state: str
-    pid: int = 0
-    cpu_percent: float | None = None
-    memory: int | None = None
-    memory_peak: int | None = None
-    restarts: int | None = None
-    max_restarts: int | None = None
-    exit: str = ""
-    cpu_limit: float | None = None
-    memory_limit: int | None = None
-    throttled: float | None = None
-    since: int = 0
-    text: str = ""
-    watchdog: int | None = None
-    sign_age: int | None = None
-    essential: bool | None = None
-    scheduling: str = ""
-    cpus: str = ""
-    silent: str = ""
-    needs: str = ""
-    outputs: tuple[OutputRow, ...] = ()
-    machine: str = ""
-    stopped_by: str = ""
-
-    @property
-    def word(self) -> str:
-        """Its state as tables have it."""
-        return SILENT if self.silent else self.state.capitalize()
 
 
 class Holder(NamedTuple):

@@ -7,17 +7,17 @@ from typing import Any, NamedTuple
 from dora_systemd.decisions.cell.counters import WHOLE_CELL
 from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES
 from dora_systemd.decisions.resources.usage import format_waits
-from dora_systemd.decisions.views.dataflows import (
+from dora_systemd.decisions.views.dataflows import format_table, node_count
+from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.formats import (
     UNKNOWN,
     format_count,
-    format_cpu,
     format_memory,
-    format_table,
+    format_percent,
     format_uptime,
-    node_count,
 )
 from dora_systemd.decisions.views.objects import Shares, dataflow_object, moment
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.terminal_text import cut
 
 SORTS = ("cpu", "memory", "name")
@@ -117,7 +117,7 @@ def _numbers(
     if row.throttled:
         shares["cpu limit"] = row.throttled
     return (
-        format_cpu(row),
+        format_percent(row.cpu_percent, row.cpu_limit),
         format_memory(row.memory, row.memory_limit),
         format_memory(row.memory_peak),
         format_count(row.restarts),

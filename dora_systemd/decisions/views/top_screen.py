@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from dora_systemd.decisions.views.dataflows import STATE_COLORS, format_table, local_time
+from dora_systemd.decisions.views.dataflows import STATE_COLORS, format_table
+from dora_systemd.decisions.views.formats import local_time
 from dora_systemd.decisions.views.top import (
     HEADER,
     NOTHING,

@@ -1,7 +1,7 @@
 """The nodes of an ended dataflow, from its life events: the runner's table is gone. Pure."""
 
 from dora_systemd.decisions.cell.asked import STOP
-from dora_systemd.decisions.views.rows import NodeRow
+from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.why.lives import Happening, Life
 
 _STATES = {

@@ -9,13 +9,8 @@ from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.logs.events import BUILD_FAILED, ROLLED_BACK
 from dora_systemd.decisions.releases.past import Switch
-from dora_systemd.decisions.views.dataflows import (
-    RESTARTING,
-    UNKNOWN,
-    colored_state,
-    local_time,
-    zoned_time,
-)
+from dora_systemd.decisions.views.dataflows import RESTARTING, colored_state
+from dora_systemd.decisions.views.formats import UNKNOWN, local_time, zoned_time
 from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.decisions.why.last_lines import Word, shown_last

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import FAILED, RESTARTING, UP_WORDS
-from dora_systemd.decisions.views.rows import NodeRow
+from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.why.lives import Happening
 
 

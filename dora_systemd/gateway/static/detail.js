@@ -139,9 +139,7 @@ export class Detail {
   /** One that has ended has no table any more; its nodes are in the journal. */
   #withEnd(flow) {
     const row = this.about?.row;
-    if (isUp(flow) || !row || isUp(row)) return flow;
-    const { nodes, restarts, nodes_total, started_us, ready_us, ended_us } = row;
-    return { ...flow, nodes, restarts, nodes_total, started_us, ready_us, ended_us };
+    return isUp(flow) || !row || isUp(row) ? flow : { ...flow, ...row };
   }
 
   #showNodes(flow, isFree) {

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.asked import is_stopped, is_stopping
 from dora_systemd.decisions.cell.counters import (
     WHOLE_CELL,
     CpuSample,
@@ -18,12 +17,12 @@ from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
     GATHERING,
     CellStatus,
-    NodeStatus,
 )
-from dora_systemd.decisions.resources.usage import Usage
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
+from dora_systemd.decisions.resources.usage import Usage, usage_facts
+from dora_systemd.decisions.views.facts import OutputRow, node_row
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.scope import Scope
-from dora_systemd.values import INFINITY, SECOND, format_cpus
+from dora_systemd.values import format_cpus
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reading import (
@@ -144,18 +143,17 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
         "nodes_total": len(names),
         "nodes_alive": alive,
         "nodes": tuple(
-            _node_row(
+            node_row(
                 node,
                 status.nodes.get(node),
                 {
                     **(_numbers(use[node], samples, now, node) if node in use else {}),
                     **away.get(node, {}),
                     **_signs(status, node, now.at_us),
+                    **_right_facts(rights, node),
+                    "cpus": _cpus(reading, node),
+                    "outputs": _outputs(reading, node),
                 },
-            )._replace(
-                **_right_facts(rights, node),
-                cpus=_cpus(reading, node),
-                outputs=_outputs(reading, node),
             )
             for node in names
         ),
@@ -211,34 +209,4 @@ def _numbers(
     use: Usage, samples: tuple[CpuSample, ...], now: CpuSample, key: str
 ) -> dict[str, Any]:
     """Usage and limits of a group, as rows have them."""
-    share = _limit(use.cpu_max)
-    return {
-        "cpu_percent": cpu_percent(samples, now, key),
-        "cpu_limit": None if share is None else 100 * share / SECOND,
-        "throttled": None if share is None else throttled_percent(samples, now, key),
-        "memory": use.memory,
-        "memory_peak": use.memory_peak,
-        "memory_limit": _limit(use.memory_max),
-    }
-
-
-def _limit(value: int | None) -> int | None:
-    return None if value == INFINITY else value
-
-
-def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> NodeRow:
-    if status is None:
-        return NodeRow(node, "unknown", **numbers)
-    facts = {
-        "pid": 0 if status.is_held else status.pid,
-        "restarts": status.restarts,
-        "max_restarts": status.max_restarts or None,
-        "exit": str(status.exit),
-        "since": status.since_us,
-        "silent": status.silent,
-        "needs": status.needs,
-        "machine": status.machine,
-        "stopped_by": status.asked_by if is_stopped(status) else "",
-    }
-    state = "stopping" if is_stopping(status) else status.state
-    return NodeRow(node, state, **facts, **numbers)  # type: ignore[arg-type]
+    return usage_facts(use, cpu_percent(samples, now, key), throttled_percent(samples, now, key))

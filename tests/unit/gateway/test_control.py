@@ -33,7 +33,8 @@ from dora_systemd.decisions.gateway.frames import (
 )
 from dora_systemd.decisions.gateway.request import Request as HttpRequest
 from dora_systemd.decisions.logs.records import log_payload
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.serve import HANDLERS, REFUSED, serve_control
 from dora_systemd.gateway.control.start import find_file

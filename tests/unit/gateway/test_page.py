@@ -8,6 +8,9 @@ import pytest
 
 from dora_systemd.decisions.gateway.request import Answer, Request
 from dora_systemd.decisions.views.dataflows import UP_WORDS
+from dora_systemd.decisions.views.facts import NODE_FACTS, USAGE, NodeRow
+from dora_systemd.decisions.views.objects import dataflow_object
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.gateway.page import DIRECTORY, HEADERS, PREFIX, TYPES, page_routes
 from dora_systemd.scope import Scope
 
@@ -81,3 +84,44 @@ def test_the_page_knows_which_dataflows_are_up() -> None:
 
 def test_frames_are_refused() -> None:
     assert HEADERS["X-Frame-Options"] == "DENY"
+
+
+FLOW = dataflow_object(DataflowRow("u", "robot", "unit", "Running", nodes=(NodeRow("a", "ready"),)))
+NODE_KEYS = set(FLOW["nodes"][0])
+FLOW_KEYS = {*FLOW, "isEnded"}
+KEYS = {
+    ("nodes.js", "facts"): NODE_KEYS,
+    ("nodes.js", "signWords"): NODE_KEYS,
+    ("words.js", "node"): NODE_KEYS,
+    ("parts.js", "showUse"): {one.key for one in USAGE},
+    ("cards.js", "flow"): FLOW_KEYS,
+    ("detail.js", "flow"): FLOW_KEYS,
+    ("detail.js", "row"): FLOW_KEYS | {"show"},
+}
+"""By script, and variable or function that takes one apart: the keys that it may name."""
+
+
+def named_keys(script: str, name: str) -> set[str]:
+    """The keys of an object that a script names."""
+    text = (DIRECTORY / script).read_text()
+    if name == "showUse":
+        text, name = (
+            text[text.index("function showUse") : text.index("function showState")],
+            "facts",
+        )
+    dotted = re.findall(rf"\b{name}\??\.(\w+)", text)
+    taken = re.findall(rf"\{{([^{{}}]*)\}} = {name};|function {name}\(\{{([^{{}}]*)\}}", text)
+    listed = [part for groups in taken for part in "".join(groups).split(",")]
+    return {*dotted, *(part.partition(":")[0].strip() for part in listed)}
+
+
+@pytest.mark.parametrize(("script", "name"), KEYS)
+def test_scripts_name_only_keys_of_the_table(script: str, name: str) -> None:
+    named = named_keys(script, name)
+    assert named
+    assert named <= KEYS[script, name]
+
+
+def test_the_table_has_all_keys() -> None:
+    moments = {f"{one.key}_us" for one in NODE_FACTS if one.is_moment}
+    assert {one.key for one in NODE_FACTS} | moments == NODE_KEYS

@@ -11,6 +11,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.releases.progress import STAGES, checking
 from dora_systemd.decisions.views import outcome
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, UP_WORDS
+from dora_systemd.decisions.views.facts import UNKNOWN_STATE, NodeRow
 from dora_systemd.decisions.views.findings import Finding, State, finding_values
 from dora_systemd.decisions.views.objects import (
     SCHEMA,
@@ -19,9 +20,8 @@ from dora_systemd.decisions.views.objects import (
     format_json,
 )
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
-from dora_systemd.decisions.views.prometheus import UNKNOWN_STATE
 from dora_systemd.decisions.views.releases import step_object
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.top import Look, TopEntry, look_values
 from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import Happening

@@ -8,9 +8,10 @@ from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, Sta
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status
 from dora_systemd.decisions.views.details import format_dataflow
+from dora_systemd.decisions.views.facts import NodeRow, OutputRow
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.prometheus import format_metrics
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.decisions.why.lives import Happening, Life
 from dora_systemd.decisions.why.postmortem import examine

@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.signs.messages import MAX_STATUS, Message, parse_message
-from dora_systemd.decisions.signs.table import Sign, format_watchdog, parse_sign, sign_facts
+from dora_systemd.decisions.signs.table import Sign, parse_sign, sign_facts
+from dora_systemd.decisions.views.formats import format_watchdog
 from dora_systemd.values import SECOND
 
 

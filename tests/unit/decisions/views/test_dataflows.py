@@ -4,16 +4,12 @@ import re
 
 import pytest
 
-from dora_systemd.decisions.views.dataflows import (
-    format_dataflows,
-    format_uptime,
-    local_time,
-    shortest_prefixes,
-    status_word,
-)
+from dora_systemd.decisions.views.dataflows import format_dataflows, shortest_prefixes, status_word
 from dora_systemd.decisions.views.details import format_dataflow
+from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.formats import format_uptime, local_time
 from dora_systemd.decisions.views.objects import dataflow_object
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.values import SECOND
 
 A = "550e8400-e29b-41d4-a716-446655440000"

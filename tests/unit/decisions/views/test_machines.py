@@ -3,9 +3,10 @@
 from dora_systemd.decisions.resources.usage import Strain, Usage
 from dora_systemd.decisions.views.dataflows import WAITING, status_word
 from dora_systemd.decisions.views.details import format_dataflow
+from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.prometheus import format_metrics
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed, observed_values
 from dora_systemd.decisions.views.top import Look, TopEntry, format_top
 from dora_systemd.values import SECOND

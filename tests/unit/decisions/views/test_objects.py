@@ -4,9 +4,10 @@ import json
 
 import pytest
 
+from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.objects import dataflow_object, format_json, moment
 from dora_systemd.decisions.views.outcome import Outcome, Thing, outcome_object
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.values import SECOND
 
 UNKNOWN = DataflowRow("u", "robot", "dora-robot.service", "Failed", nodes=(NodeRow("a", "failed"),))

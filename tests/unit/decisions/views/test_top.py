@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.top import (
     NOTHING,
     Look,

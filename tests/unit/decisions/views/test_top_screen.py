@@ -2,7 +2,8 @@
 
 import pytest
 
-from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.top import NOTHING, Look, TopEntry
 from dora_systemd.decisions.views.top_screen import HELP, TopScreen
 

@@ -11,7 +11,7 @@ from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.rights.node_rights import parse_node_rights
-from dora_systemd.decisions.views.rows import OutputRow
+from dora_systemd.decisions.views.facts import OutputRow
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_times
 from dora_systemd.values import SECOND
