@@ -6,8 +6,7 @@ from dora_systemd.adapters.bus.manager import Manager, StageObserver, tell_stage
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.parts import refuse_parts
+from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.needs.dependents import find_dependents
 from dora_systemd.verbs.node import NodeOrder, order_node

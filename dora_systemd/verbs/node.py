@@ -21,8 +21,7 @@ from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_e
 from dora_systemd.trust.sockets import require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
-from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.parts import CONTROL, refuse_parts
+from dora_systemd.verbs.facts.cells import CONTROL, Cell, refuse_parts
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.inhibit.guard import IfInhibited, Tell, require_uninhibited
 from dora_systemd.verbs.start.asked import caller

@@ -24,8 +24,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.values import format_bool
-from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.parts import refuse_parts
+from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.node import require_node, require_running, socket_of
 
 Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]

@@ -39,10 +39,9 @@ from dora_systemd.decisions.settings.table import CHANGEABLE, LOG_RATE_LIMIT
 from dora_systemd.decisions.unit.properties import settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.nodes import written_dataflow
-from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.reload import Ask, limit_lines, remember
 from dora_systemd.verbs.start.limits import require_controllers

@@ -14,10 +14,10 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists
 from dora_systemd.values import INFINITY, SECOND, format_duration
+from dora_systemd.verbs.facts.budget import read_restarts
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units, own_directories, trial_path
 from dora_systemd.verbs.facts.reason import failure_reason
-from dora_systemd.verbs.facts.restarts import read_restarts
 from dora_systemd.verbs.start.asked import note_request
 
 UNBOUNDED_SECONDS = 90.0

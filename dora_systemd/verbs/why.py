@@ -21,7 +21,7 @@ from dora_systemd.decisions.why.verdict import Facts, Verdict
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of, unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.budget import restart_budget
+from dora_systemd.verbs.facts.budget import read_restarts, restart_budget, without_refused
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.ended import newest_ended, not_recorded
 from dora_systemd.verbs.facts.held import read_held
@@ -29,7 +29,6 @@ from dora_systemd.verbs.facts.list import mark_enabled, read_rows
 from dora_systemd.verbs.facts.lives import now_boot, read_lives
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
-from dora_systemd.verbs.facts.restarts import read_restarts, without_refused
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.whole import read_whole_rows
 

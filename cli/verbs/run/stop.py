@@ -22,9 +22,8 @@ from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
-from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
+from dora_systemd.verbs.facts.cells import Cell, proven, read_cells, refuse_parts, without_parts
 from dora_systemd.verbs.facts.locks import read_holders
-from dora_systemd.verbs.facts.parts import refuse_parts, without_parts
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 from dora_systemd.verbs.needs.dependents import find_dependents, format_dependents
 from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within

@@ -103,9 +103,7 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     if raw.get("restart_policy", "never") == "never" and is_launched(node):
         raw |= _keys_of_kept(node.id, plan.options)
     if machine := placed_on(plan.options.placed, node.id):
-        from dora_systemd.decisions.cell.placed import placed_node
-
-        return placed_node(node.id, raw, machine, PERL)
+        return _placed_node(node.id, raw, machine)
     if isinstance(deploy := raw.get("deploy"), Mapping):  # this machine, whose daemon has no name
         raw["deploy"] = {**deploy, "machine": None, "labels": {}}
     if node.kind is NodeKind.OPERATOR:
@@ -315,3 +313,17 @@ def _refusal(source: str, node: Node, reason: str, hint: str) -> DoraSystemdErro
     return DoraSystemdError(
         f"cannot start {source}: node {node.id}: {reason}", hint, ExitCode.BAD_INPUT
     )
+
+
+_BUILT = ("build", "git", "branch", "tag", "rev")
+_LAUNCH = '$f = "$ENV{DORA_SYSTEMD_CELL}/launch/%s"; do $f; die "cannot run $f: $@$!\\n"'
+
+
+def _placed_node(node: str, raw: Mapping[str, Any], machine: str) -> dict[str, Any]:
+    """A node on another machine, for dora; with_works() fills in the directory.
+
+    How it is started, that machine itself knows: the file launch/NODE in its cell says it.
+    """
+    kept = {key: value for key, value in raw.items() if key not in _BUILT}
+    deploy = {"machine": machine, "working_dir": None}
+    return {**kept, "deploy": deploy, "path": PERL, "args": shlex.join(["-e", _LAUNCH % node])}

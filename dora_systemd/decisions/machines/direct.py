@@ -1,7 +1,7 @@
 """`link: direct`: zenoh between machines without ssh, on addresses that somebody has chosen. Pure.
 
 zenoh of dora has no password and no encryption. So it listens on these addresses and no others, and
-the units exchange packets with them and with no others, see decisions/unit/addresses.py.
+the units exchange packets with them and with no others, see decisions/unit/properties.py.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,8 @@
 """The programs through which a node is executed, each of which sets one thing and goes on.
 
 They are those of util-linux and coreutils: prlimit(1), chrt(1), nice(1), taskset(1), choom(1). What
-raises rights is granted by the unit to all of its processes, see decisions/unit/rights.py. So the
-other nodes give it up here. They give up hard limits, which no process gets back. An OOM score
+raises rights is granted by the unit to all of its processes, see decisions/unit/properties.py. So
+the other nodes give it up here. They give up hard limits, which no process gets back. An OOM score
 adjustment can be lowered again, to what the unit has: the kernel keeps that value for all children.
 """
 

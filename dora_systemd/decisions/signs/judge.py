@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from enum import Enum
 from typing import NamedTuple
 
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.values import INFINITY, SECOND, format_duration
 
 _LOOKS = 8
 """Looks of the runner in the time of the shortest watchdog."""
@@ -106,3 +106,18 @@ class Watch(NamedTuple):
             return Act.ABORT if is_late else Act.NOTHING
         is_over = now - self.aborted >= min(grace, LONGEST) and not self.is_killed
         return Act.KILL if is_over else Act.NOTHING
+
+
+# Journals keep these texts, so they never change.
+TRIGGERED = "it sent WATCHDOG=trigger"
+_SAYS = {Phase.RUNNING: "no WATCHDOG=1 for ", Phase.STARTING: "not ready within "}
+
+
+def missed(phase: Phase, limit: int) -> str:
+    """The reason for a watchdog of `limit` µs."""
+    return f"{_SAYS[phase]}{format_duration(limit)}"
+
+
+def by_watchdog(reason: str) -> bool:
+    """Whether a node hung for one of these reasons, and not by dora's health check."""
+    return reason == TRIGGERED or reason.startswith(tuple(_SAYS.values()))

@@ -17,7 +17,7 @@ from dora_systemd.decisions.cell.options import (
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.life.stop_budget import unit_timeout
 from dora_systemd.decisions.needs.devices import device_entries
-from dora_systemd.decisions.needs.units import needs_properties
+from dora_systemd.decisions.needs.units import NETWORK_UNIT, needs_properties
 from dora_systemd.decisions.properties.assignments import (
     Properties,
     format_property,
@@ -30,14 +30,14 @@ from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.sandbox import Sandbox, sandbox_properties
 from dora_systemd.decisions.properties.structs import Command
 from dora_systemd.decisions.properties.table import TABLE
+from dora_systemd.decisions.rights.commands import NICE_LIMIT
+from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.decisions.settings.credentials import credential_properties
 from dora_systemd.decisions.settings.limits import REALTIME
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import PROPERTY
-from dora_systemd.decisions.unit.addresses import address_properties
 from dora_systemd.decisions.unit.file import format_sections
-from dora_systemd.decisions.unit.rights import rights_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, release_of, unit_description
 from dora_systemd.scope import RUNTIME_NAME
@@ -266,3 +266,33 @@ def realtime_properties(settings: Settings) -> dict[str, Property]:
     policy, _, priority = given.partition(":")
     texts = (f"CPUSchedulingPolicy={policy}", f"CPUSchedulingPriority={priority}")
     return with_assignments({}, texts)
+
+
+def rights_properties(rights: Sequence[NodeRights]) -> dict[str, Property]:
+    """LimitRTPRIO=, LimitNICE= and OOMScoreAdjust=; the launcher takes them from the other nodes.
+
+    The runner and dora keep them. Without dora there is no node, so its memory goes last as well.
+    """
+    priority = max((one.priority for one in rights), default=0)
+    nice = min((one.nice or 0 for one in rights), default=0)
+    oom = min((one.oom_score_adjust or 0 for one in rights), default=0)
+    texts = {
+        "LimitRTPRIO": priority,
+        "LimitNICE": NICE_LIMIT - nice if nice < 0 else 0,
+        "OOMScoreAdjust": min(oom, 0),
+    }
+    return with_assignments({}, [f"{key}={number}" for key, number in texts.items() if number])
+
+
+def address_properties(addresses: Sequence[str], is_user: bool) -> dict[str, Property]:
+    """Packets to and from these machines only, see systemd.resource-control(5).
+
+    addresses: of all machines; () if they do not meet like this. A user's manager can neither
+    filter packets nor wait for the network.
+    """
+    if not addresses or is_user:
+        return {}
+    lines = ["IPAddressDeny=any", "IPAddressAllow=localhost"]
+    lines += [f"IPAddressAllow={one}" for one in addresses]
+    lines += [f"{key}={NETWORK_UNIT}" for key in ("Wants", "After")]
+    return with_assignments({}, lines)

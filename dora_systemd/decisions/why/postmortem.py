@@ -14,7 +14,7 @@ from dora_systemd.decisions.life.causes import ESSENTIAL, NO_END, UNIT_RESULTS, 
 from dora_systemd.decisions.life.setup_exits import setup_failure
 from dora_systemd.decisions.logs.events import NODE_END_EVENTS
 from dora_systemd.decisions.reload.steps import How
-from dora_systemd.decisions.signs.words import by_watchdog
+from dora_systemd.decisions.signs.judge import by_watchdog
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
 from dora_systemd.decisions.why.nodes import ended_nodes

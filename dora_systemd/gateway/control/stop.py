@@ -16,8 +16,7 @@ from dora_systemd.gateway.control.state import ended_result
 from dora_systemd.gateway.control.talk import Talk, find_by_uuid
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
-from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.parts import refuse_parts
+from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.needs.dependents import find_dependents

@@ -16,8 +16,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State
-from dora_systemd.decisions.signs.judge import Act, Phase, Watch, limit_in
-from dora_systemd.decisions.signs.words import TRIGGERED, missed
+from dora_systemd.decisions.signs.judge import TRIGGERED, Act, Phase, Watch, limit_in, missed
 from dora_systemd.runner.signs.none import NoSigns
 from dora_systemd.runner.signs.sockets import Ear, Signs
 from dora_systemd.values import SECOND

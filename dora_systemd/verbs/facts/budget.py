@@ -5,9 +5,10 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.decisions.cell.restarts import unit_budget
 from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.views.dataflows import RESTARTING
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
@@ -80,3 +81,20 @@ def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
     policy = cell.options.restart
     delay = max(int(facts["RestartUSec"]), 0 if policy.policy == "no" else policy.delay)
     return max(int(facts["StateChangeTimestampMonotonic"]) + delay - now, 0)
+
+
+def read_restarts(manager: Manager, cell: Cell) -> int:
+    """Ask systemd how often it has restarted the unit of a dataflow."""
+    counted = int(manager.read(cell.unit, ["NRestarts"])["NRestarts"])
+    return without_refused(manager, cell, counted)
+
+
+def without_refused(manager: Manager, cell: Cell, counted: int) -> int:
+    """The restarts that have happened. counted: NRestarts=.
+
+    NRestarts= counts the restart that the runner has refused, too, because no restart was left.
+    """
+    if not counted or cell.state.active in SETTLED:
+        return counted
+    status = manager.read(cell.unit, ["ExecMainStatus"])["ExecMainStatus"]
+    return counted - 1 if status == RunnerExit.RESTARTS_SPENT else counted

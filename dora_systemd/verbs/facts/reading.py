@@ -102,7 +102,7 @@ def read_dataflow(
         unit = manager.read(cell.unit, _ALL if cell.is_up else (*_ALL, ENDED))
     if unit["NRestarts"]:
         # Imported late: most dataflows have never been restarted.
-        from dora_systemd.verbs.facts.restarts import without_refused
+        from dora_systemd.verbs.facts.budget import without_refused
 
         unit["NRestarts"] = without_refused(manager, cell, unit["NRestarts"])
     if not cell.is_up or not (path or unit["ControlGroup"]):
@@ -120,8 +120,8 @@ def read_dataflow(
 
 def _read_held(manager: Manager, cell: Cell) -> Reading:
     # Imported late: few dataflows need anything, and those that run have it.
+    from dora_systemd.verbs.facts.budget import read_restarts
     from dora_systemd.verbs.facts.held import read_held
-    from dora_systemd.verbs.facts.restarts import read_restarts
 
     unit = {"NRestarts": read_restarts(manager, cell)}
     return Reading(cell, unit, at_us=_monotonic_us(), held=read_held(manager, cell))

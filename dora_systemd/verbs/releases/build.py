@@ -16,7 +16,7 @@ from signal import SIGKILL
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager, Property, is_at_rest
 from dora_systemd.adapters.releases.build_tree import BuildTree
-from dora_systemd.adapters.releases.store import Store
+from dora_systemd.adapters.releases.store import Store, remove_tree
 from dora_systemd.decisions.cell.options import build_command
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.logs.events import BUILD_FAILED
@@ -38,6 +38,7 @@ from dora_systemd.verbs.releases.built_files import find_built
 from dora_systemd.verbs.releases.files import copy_files
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source
+from dora_systemd.verbs.releases.trial import Standing, remains
 from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.check import beside_properties, exec_start
@@ -242,3 +243,14 @@ def _sent(manager: Manager, build: Build, tree: BuildTree, reading: int) -> list
         ("CollectMode", "s", "inactive-or-failed"),
         ("AddRef", "b", True),
     ]
+
+
+def clean(manager: Manager, store: Store, standing: Standing) -> None:
+    """Remove what a deploy or rollback that was killed has left, and end a build that still runs.
+
+    The caller holds the lock of the store. Raises DoraSystemdError.
+    """
+    if store.unfinished():
+        end_former(manager, build_unit(store.name))
+    for path in remains(store, standing):
+        remove_tree(path)

@@ -23,8 +23,8 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.project import opened_project
 from dora_systemd.values import SECOND, shown
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
+from dora_systemd.verbs.releases.build import clean
 from dora_systemd.verbs.releases.change import Change, change_release
-from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.copy import copy_project, newest, repository_owners
 from dora_systemd.verbs.releases.files import digests, find_files
 from dora_systemd.verbs.releases.listing import store_of

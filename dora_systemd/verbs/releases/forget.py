@@ -13,7 +13,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.releases.clean import clean
+from dora_systemd.verbs.releases.build import clean
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
 from dora_systemd.verbs.releases.past import note_removal
 from dora_systemd.verbs.releases.trial import Standing, read_standing

@@ -17,8 +17,7 @@ from dora_systemd.names import is_name, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.verbs.releases.past import read_past
-from dora_systemd.verbs.releases.remains import remains
-from dora_systemd.verbs.releases.trial import Standing, read_standing
+from dora_systemd.verbs.releases.trial import Standing, read_standing, remains
 
 _MOST_NAMES = 10_000
 

@@ -17,8 +17,8 @@ from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted, shown
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
+from dora_systemd.verbs.releases.build import clean
 from dora_systemd.verbs.releases.change import Change, change_release, stop_observer
-from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
 from dora_systemd.verbs.releases.past import KILLED, note_fault, read_past

@@ -5,6 +5,7 @@ precedence over the one in /etc, which stays as it is, and a reboot removes it. 
 in a trial, the machine boots what has proved itself.
 """
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,9 +13,11 @@ from pathlib import Path
 from dora_systemd.adapters.bus.manager import DOWN, Manager, Observer, queued_job
 from dora_systemd.adapters.host.unit_files import (
     read_unit_file,
+    remains_of,
     remove_unit_file,
     write_unit_file,
 )
+from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -181,3 +184,11 @@ def _reload(manager: Manager) -> None:
             manager.reload()
             return
     manager.reload()
+
+
+def remains(store: Store, standing: Standing) -> Iterator[Path]:
+    """What a deploy or rollback that was killed has left: doctor names it, clean() removes it."""
+    used = {store.release(one) for one in (standing.current, standing.trial) if one}
+    yield from (path for path in store.unfinished() if path not in used)
+    for place in (standing.boot.path, standing.path):
+        yield from remains_of(place)

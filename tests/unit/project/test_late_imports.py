@@ -93,14 +93,13 @@ LATE = {
         "runner.owes.begin": {"runner.owes.watch"},
         "verbs.facts.reading": {
             *("decisions.machines.usage", "decisions.owes.feeds", "decisions.owes.probe"),
-            *("verbs.facts.held", "verbs.facts.restarts"),
+            *("verbs.facts.held", "verbs.facts.budget"),
         },
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},
     },
     "most dataflows run on one machine and have no releases, and most links are not lost": {
-        "decisions.cell.launch": {"decisions.cell.placed"},
         "runner.roles": {"runner.machines.head", "runner.machines.member"},
         "gateway.control.logs": {"decisions.machines.elsewhere"},
         "gateway.live.lines": {"decisions.machines.elsewhere"},

@@ -13,8 +13,12 @@ from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.machines.spread import spread
 from dora_systemd.decisions.machines.wire import Forwards
 from dora_systemd.decisions.settings.resolve import resolve_settings
-from dora_systemd.decisions.unit.addresses import address_properties
-from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
+from dora_systemd.decisions.unit.properties import (
+    UnitContext,
+    address_properties,
+    format_unit,
+    unit_properties,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 FILE = "/srv/robot/dataflow.yml"

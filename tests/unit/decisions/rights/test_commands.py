@@ -9,7 +9,7 @@ from dora_systemd.decisions.rights.commands import (
     rights_commands,
 )
 from dora_systemd.decisions.rights.node_rights import parse_node_rights
-from dora_systemd.decisions.unit.rights import rights_properties
+from dora_systemd.decisions.unit.properties import rights_properties
 
 
 def commands(*texts: str, base: Base | None = None) -> dict[str, str]:

@@ -8,8 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.signs.judge import Act, Clock, Phase, Watch, limit_in, period_of
-from dora_systemd.decisions.signs.words import TRIGGERED, by_watchdog, missed
+from dora_systemd.decisions.signs.judge import (
+    TRIGGERED,
+    Act,
+    Clock,
+    Phase,
+    Watch,
+    by_watchdog,
+    limit_in,
+    missed,
+    period_of,
+)
 from dora_systemd.values import INFINITY, SECOND
 
 LIMIT, GRACE, HOUR = 4 * SECOND, 10 * SECOND, 3600 * SECOND

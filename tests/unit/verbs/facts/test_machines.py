@@ -6,9 +6,8 @@ from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.machines.link_command import LinkOptions, link_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.cells import CONTROL, read_cells, refuse_parts, without_parts
 from dora_systemd.verbs.facts.machines import member_hosts
-from dora_systemd.verbs.facts.parts import CONTROL, refuse_parts, without_parts
 from dora_systemd.verbs.set import set_limits
 from tests.unit.fakes.manager import FakeManager, options
 

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.budget import read_restarts
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import read_rows, table_rows
-from dora_systemd.verbs.facts.restarts import read_restarts
 from dora_systemd.verbs.facts.snapshot import read_snapshot
 from dora_systemd.verbs.facts.whole import read_whole_rows
 from dora_systemd.verbs.stop import reset_cells

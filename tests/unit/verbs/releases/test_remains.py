@@ -9,9 +9,8 @@ from dora_systemd.adapters.releases.store import Store
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import listing as module
-from dora_systemd.verbs.releases.clean import clean
-from dora_systemd.verbs.releases.remains import remains
-from dora_systemd.verbs.releases.trial import read_standing
+from dora_systemd.verbs.releases.build import clean
+from dora_systemd.verbs.releases.trial import read_standing, remains
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.verbs.releases.test_trial import NEW, OLD, UNIT, deployed, etc, store
 
