@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager
-from dora_systemd.adapters.host.loopback import port_error
+from dora_systemd.adapters.host.addresses import port_error
 from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.unit_files import put_unit_file, read_unit_file
 from dora_systemd.adapters.releases.store import make_directories, store_root

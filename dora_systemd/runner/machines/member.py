@@ -7,18 +7,21 @@ has been told is in memory only.
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host import files
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.splice import Ends, taken_over
 from dora_systemd.decisions.cell.asked import RESTART, STOP
+from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus
@@ -32,6 +35,7 @@ from dora_systemd.decisions.machines.part import (
     launch_files,
 )
 from dora_systemd.decisions.machines.programs import format_digests
+from dora_systemd.decisions.machines.usage import told_use
 from dora_systemd.decisions.rights.node_rights import without_essential
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
@@ -46,7 +50,6 @@ from dora_systemd.runner.machines.member_boot import MemberBoot, no_head
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
 from dora_systemd.runner.machines.programs import own_digests, read_digests
 from dora_systemd.runner.machines.shared import Shared
-from dora_systemd.runner.machines.uses import Uses
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import INFINITY
@@ -59,6 +62,35 @@ _LONGEST = 100
 
 async def _connection_of(boot: MemberBoot) -> Ends:
     return await taken_over(boot.connection, boot.rest, wire.MAX_LINE)
+
+
+class Uses:
+    """Reads the groups of the nodes as often as the runner samples them, and at each new stage.
+
+    For the head, which cannot see the cgroups of this machine.
+    """
+
+    def __init__(self, nodes: Nodes) -> None:
+        self._nodes = nodes
+        self._seen: tuple[object, str] = ((), "")
+        self._told: Mapping[str, list[Any]] = {}
+
+    def added(self, table: CellStatus) -> CellStatus:
+        """The table of this machine, with what its nodes use."""
+        seen = table.samples, table.stage
+        if seen != self._seen:
+            self._seen, self._told = seen, self._read(table)
+        return table._replace(usage=self._told)
+
+    def _read(self, table: CellStatus) -> Mapping[str, list[Any]]:
+        groups = cgroup.node_groups(self._nodes.places[0])
+        uses = {node: cgroup.read_usage(groups[node]) for node in table.nodes if node in groups}
+        now = CpuSample(
+            time.monotonic_ns() // 1000,
+            {node: use.cpu_us for node, use in uses.items()},
+            {node: use.throttling for node, use in uses.items()},
+        )
+        return {node: told_use(use, table.samples, now, node) for node, use in uses.items()}
 
 
 class Member(Shared):

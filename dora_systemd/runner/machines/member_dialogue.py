@@ -15,10 +15,10 @@ from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.own import is_here
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.pump import now_us
+from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import MemberEngine
-from dora_systemd.runner.machines.processes import find
+from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
 _POLL_SECONDS, _SOON, _LATER_SECONDS = 0.05, 200, 0.5
@@ -65,7 +65,7 @@ class MemberDialogue(Dialogue):
         return {
             **own,
             Do.GATHER: lambda: self._ask(Do.GATHER, self._find_run()),
-            Do.ASK_SPAWN: lambda: self.spawn("find processes", find(self._pump, self._nodes)),
+            Do.ASK_SPAWN: lambda: self.spawn("find processes", find_pids(self._pump, self._nodes)),
             Do.ASK_RESULT: self._tell_result,
             Do.ASK_STOP: lambda: self._ask(Do.END_NODES, self._stop()),
             Do.END_NODES: self._end_without_head,
@@ -176,3 +176,31 @@ def is_going_down(is_of_user: bool) -> bool:
         done = run_command(["systemctl", *scope, "is-system-running"], _ASK_SECONDS)
         return done.stdout.strip() in ("stopping", *_UNKNOWN)
     return True
+
+
+_FIND_SECONDS = 10.0
+
+
+async def find_pids(pump: Pump, nodes: Nodes) -> None:
+    """Tell the pids of nodes that are starting, until each of them is known or has gone on.
+
+    dora has told of them before this machine could hear it: a member looks for the run that the
+    head has started. Their launchers wait for the pipes, and have noted their pid.
+    """
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(_FIND_SECONDS):
+            while missing := _without_process(pump):
+                for node in missing:
+                    _tell(pump, nodes, node, nodes.noted_pid(node))
+                await asyncio.sleep(_POLL_SECONDS)
+
+
+def _without_process(pump: Pump) -> list[str]:
+    found = pump.cell.nodes.items()
+    return [ident for ident, one in found if one.state == "starting" and not one.pid]
+
+
+def _tell(pump: Pump, nodes: Nodes, node: str, pid: int) -> None:
+    if pid:
+        nodes.adopt(node, pid)
+        pump.push(life.NodeSpawned(now_us(), node, pid))

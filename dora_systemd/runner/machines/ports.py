@@ -4,8 +4,7 @@ import os
 from collections.abc import Sequence
 from errno import EADDRINUSE
 
-from dora_systemd.adapters.host.addresses import listen_error
-from dora_systemd.adapters.host.loopback import port_error
+from dora_systemd.adapters.host.addresses import listen_error, port_error
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.machines.wire import PORT_RANGE, Forwards
 from dora_systemd.errors import DoraSystemdError

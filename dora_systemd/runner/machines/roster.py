@@ -19,7 +19,7 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.awaited import NOT_CONNECTED, NOT_JOINED, USUAL
-from dora_systemd.decisions.machines.tables import merged
+from dora_systemd.decisions.machines.usage import merged
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.machines.head_boot import GREETED, forwards

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from dora_systemd.adapters.host.loopback import port_error
+from dora_systemd.adapters.host.addresses import port_error
 from dora_systemd.adapters.host.process import read_child
 from dora_systemd.adapters.ssh.program import start_ssh
 from dora_systemd.decisions.cell.machines import HEAD

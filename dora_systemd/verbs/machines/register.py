@@ -1,11 +1,14 @@
 """`doractl machine add`, `list`, `check` and `remove`."""
 
+import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from stat import S_IMODE
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml, write_atomic
+from dora_systemd.adapters.host.process import run_command
 from dora_systemd.decisions.cell.machines import parse_machine
 from dora_systemd.decisions.machines.declared import with_machine, without_machine
 from dora_systemd.decisions.machines.entry import parse_entry
@@ -17,8 +20,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
+from dora_systemd.trust.programs import own_account
 from dora_systemd.values import quoted, shown
-from dora_systemd.verbs.machines.keys import make_key, public_key, remove_key
 from dora_systemd.verbs.machines.own import own_facts
 from dora_systemd.verbs.machines.probe import Probe, probe_as_caller, probe_as_link, run_there
 from dora_systemd.verbs.start.settings import config_file, key_place, read_config
@@ -185,3 +188,37 @@ def _write(file: Path, text: str) -> None:
     # It may have secrets, such as values of env.
     mode = S_IMODE(read_file(file).place.mode) if exists(file) else _NEW_MODE
     write_atomic(file, text, mode, is_durable=True)
+
+
+_KEY_SECONDS = 30.0
+
+
+def make_key(place: Path, machine: str) -> Path:
+    """The key of a machine, which is there then. Raises DoraSystemdError."""
+    path = place / machine
+    if exists(path):
+        return path
+    try:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        code = ExitCode.NO_PERMISSION if isinstance(error, PermissionError) else ExitCode.FAILURE
+        raise DoraSystemdError(f"cannot create {place}: {error.strerror}", "", code) from error
+    words = ("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", f"dora-systemd {machine}")
+    done = run_command((*words, "-f", str(path)), _KEY_SECONDS, os.environ, None, own_account())
+    if done.status:
+        words_of_it = (done.stderr or done.stdout).strip().splitlines()[-1:]
+        raise DoraSystemdError(f"cannot make the key {path}: {''.join(words_of_it)}")
+    return path
+
+
+def public_key(path: Path) -> str:
+    """The public part of a key."""
+    public = path.with_name(f"{path.name}.pub")
+    return decoded(read_file(public).data, public).strip()
+
+
+def remove_key(path: Path) -> None:
+    """Remove both parts of a key."""
+    for one in (path, path.with_name(f"{path.name}.pub")):
+        with suppress(FileNotFoundError):
+            one.unlink()

@@ -68,7 +68,7 @@ _TABLE = {
         adapters.releases.store verbs.releases.source verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
-        verbs.machines.keys verbs.machines.register
+        verbs.machines.register
         verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """
@@ -87,7 +87,7 @@ _TABLE = {
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
     OTHERWISE: """
-        adapters.dora.control adapters.host.addresses adapters.host.loopback verbs.node
+        adapters.dora.control adapters.host.addresses verbs.node
         verbs.start.places
     """,
 }

@@ -7,8 +7,7 @@ import pytest
 
 from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
-from dora_systemd.decisions.machines.tables import merged
-from dora_systemd.decisions.machines.usage import NodeUse, parse_use, told_use, uses_of
+from dora_systemd.decisions.machines.usage import NodeUse, merged, parse_use, told_use, uses_of
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.values import INFINITY, SECOND
 

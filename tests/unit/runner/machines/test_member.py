@@ -27,8 +27,7 @@ from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.machines.engine import MemberEngine
 from dora_systemd.runner.machines.member import Member
 from dora_systemd.runner.machines.member_boot import MemberBoot
-from dora_systemd.runner.machines.member_dialogue import MemberDialogue
-from dora_systemd.runner.machines.processes import find
+from dora_systemd.runner.machines.member_dialogue import MemberDialogue, find_pids
 from dora_systemd.values import SECOND
 from tests.unit.fakes.dialogue import Heard
 from tests.unit.fakes.ends import FakeEnds
@@ -337,7 +336,7 @@ def test_the_first_processes_are_those_that_the_launchers_note(tmp_path: Path) -
     async def work() -> None:
         bench = Bench(tmp_path, State.WAITING)
         bench.be(nodes={"mid": NodeStatus("starting"), "late": NodeStatus("running", 8)})
-        found = asyncio.ensure_future(find(bench.pump, bench.nodes))
+        found = asyncio.ensure_future(find_pids(bench.pump, bench.nodes))
         await settle()
         CellPaths(tmp_path).node_pid("mid").write_text("77")
         while not bench.pump.heard:
