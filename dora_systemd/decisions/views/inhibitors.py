@@ -60,21 +60,10 @@ def _command(holder: Holder) -> str:
     return cut(" ".join(words), _COMMAND_WIDTH)
 
 
-def holder_object(holder: Holder) -> dict[str, Any]:
-    """A holder for JSON."""
-    return {
-        "pid": holder.pid or None,
-        "user": holder.user or None,
-        "command": holder.command or None,
-        "node": holder.node or None,
-        "why": holder.why or None,
-    }
-
-
 def inhibited_objects(rows: Sequence[Inhibited]) -> list[Mapping[str, Any]]:
     """What `doractl inhibit -o json` prints: an object for each lock."""
     return [
-        {"name": row.name, "uuid": row.uuid, "unit": row.unit, **holder_object(holder)}
+        {"name": row.name, "uuid": row.uuid, "unit": row.unit, **holder.values()}
         for row in rows
         for holder in row.holders
     ]

@@ -5,15 +5,14 @@ What is unknown is None, and becomes null. Units are in the keys. A point in tim
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dora_systemd.decisions.cell.counters import WHOLE_CELL
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.releases.past import Switch
-from dora_systemd.decisions.views.facts import NODE_FACTS, USAGE, NodeRow
-from dora_systemd.decisions.views.inhibitors import holder_object
-from dora_systemd.decisions.views.rows import DataflowRow
+from dora_systemd.decisions.views.facts import NODE_FACTS, Fact, NodeRow
+from dora_systemd.decisions.views.rows import DATAFLOW_FACTS, DataflowRow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import format_moment
 
@@ -61,43 +60,25 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
     waits: by node, WHOLE_CELL is the whole dataflow; only `top` knows them.
     """
     shares = waits or {}
-    is_counted = row.nodes_total and not row.problem
-    return {
-        "name": row.name,
-        "uuid": row.uuid,
-        "unit": row.unit,
-        "file": row.dataflow or None,
-        "release": row.release or None,
-        "status": row.status,
-        "waits_for": row.needs or None,
-        **moment("waits_since", row.waits_since),
-        "text": row.text or None,
-        "problem": row.problem or None,
-        "enabled": row.enabled,
-        "inhibitors": list(map(holder_object, row.inhibitors)),
-        "uptime_us": row.uptime,
-        **moment("started", row.started),
-        **moment("ready", row.ready),
-        **moment("ended", row.ended),
-        "nodes_alive": row.nodes_alive if is_counted else None,
-        "nodes_total": row.nodes_total if is_counted else None,
-        **{one.key: one.of(row) for one in USAGE},
-        "waits_percent": shares.get(WHOLE_CELL) or None,
-        "restarts": row.restarts,
-        "restart_budget": row.restart_budget,
-        "machine": row.machine or None,
-        "machines": list(row.machines),
-        "nodes": [_node_object(row, one, shares.get(one.node)) for one in row.nodes],
-    }
+    values = _values(DATAFLOW_FACTS, row, shares.get(WHOLE_CELL))
+    if not row.nodes_total or row.problem:
+        values |= {"nodes_alive": None, "nodes_total": None}
+    return {**values, "nodes": [_node_object(row, one, shares.get(one.node)) for one in row.nodes]}
 
 
 def _node_object(whole: DataflowRow, row: NodeRow, shares: Shares | None) -> dict[str, Any]:
+    machine = row.machine or (HEAD if whole.machines else None)
+    return {**_values(NODE_FACTS, row, shares), "machine": machine}
+
+
+def _values(
+    facts: Sequence[Fact], row: DataflowRow | NodeRow, shares: Shares | None
+) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for fact in NODE_FACTS:
+    for fact in facts:
         value = fact.value(fact.of(row))
         values |= moment(fact.key, value) if fact.is_moment else {fact.key: value}
-    machine = row.machine or (HEAD if whole.machines else None)
-    return {**values, "machine": machine, "waits_percent": shares or None}
+    return {**values, "waits_percent": shares or None}
 
 
 def error_object(error: DoraSystemdError) -> dict[str, Any]:

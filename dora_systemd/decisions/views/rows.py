@@ -1,9 +1,9 @@
-"""The rows of `doractl list`: facts of dataflows."""
+"""The rows of `doractl list`: a field for each fact of a dataflow, and its key in JSON."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.facts import USAGE, Fact, NodeRow
 from dora_systemd.names import release_of
 
 
@@ -19,6 +19,10 @@ class Holder(NamedTuple):
     command: str = ""
     node: str = ""
     why: str = ""
+
+    def values(self) -> dict[str, Any]:
+        """The holder for JSON."""
+        return {key: value or None for key, value in self._asdict().items()}
 
 
 class DataflowRow(NamedTuple):
@@ -66,3 +70,31 @@ class DataflowRow(NamedTuple):
     def release(self) -> str:
         """The release that it runs, "" if it was not deployed."""
         return release_of(self.dataflow) or self.listed_release
+
+
+DATAFLOW_FACTS = (
+    Fact("name", value=str),
+    Fact("uuid", value=str),
+    Fact("unit", value=str),
+    Fact("file", "dataflow"),
+    Fact("release"),
+    Fact("status", value=str),
+    Fact("waits_for", "needs"),
+    Fact("waits_since", is_moment=True),
+    Fact("text"),
+    Fact("problem"),
+    Fact("enabled"),
+    Fact("inhibitors", value=lambda holders: [one.values() for one in holders]),
+    Fact("uptime_us", "uptime"),
+    Fact("started", is_moment=True),
+    Fact("ready", is_moment=True),
+    Fact("ended", is_moment=True),
+    Fact("nodes_alive"),
+    Fact("nodes_total"),
+    *USAGE,
+    Fact("waits_percent"),
+    Fact("restarts"),
+    Fact("restart_budget"),
+    Fact("machine"),
+    Fact("machines", value=list),
+)

@@ -2,6 +2,7 @@
 
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.views.facts import NODE_FACTS, NodeRow, node_row, node_table
+from dora_systemd.decisions.views.rows import DATAFLOW_FACTS, DataflowRow
 
 SHOWN_BY_OTHERS = {"waits_percent"}
 """What `top` and the page measure: a row has no field for it."""
@@ -11,6 +12,11 @@ def test_every_field_has_one_row() -> None:
     names = [one.field or one.key for one in NODE_FACTS if one.key not in SHOWN_BY_OTHERS]
     assert sorted(names) == sorted(NodeRow._fields)
     assert len({one.key for one in NODE_FACTS}) == len(NODE_FACTS)
+
+
+def test_every_field_of_a_dataflow_has_one_row() -> None:
+    names = {one.field or one.key for one in DATAFLOW_FACTS} - {"release"}
+    assert names - SHOWN_BY_OTHERS == {*DataflowRow._fields} - {"nodes", "listed_release"}
 
 
 def test_columns_and_metrics_are_whole() -> None:
