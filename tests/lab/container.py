@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lab import cgroup, image
+from lab.bytecode import ensure_bytecode
 from lab.cache import find_cache
 from lab.errors import LabError
 from lab.options import Options
@@ -35,11 +36,17 @@ def run_in_container(run: Run, tree: Path, options: Options) -> int:
     need_tools("systemd-nspawn")
     if len(options.commands) > 1:
         raise LabError("reboot a container", "LAB=vm")
-    source = run.directory / "src"
-    source.mkdir(mode=0o755)
-    image.copy_checkout(source)
+    place_checkout(run.directory / "src")
     with started_container(run, tree, options.out) as container, kept_terminal():
         return subprocess.run(enter_command(container, options), check=False).returncode
+
+
+def place_checkout(source: Path) -> None:
+    """Put a copy of the checkout there, with its modules compiled."""
+    source.mkdir(mode=0o755)
+    image.copy_checkout(source)
+    unpack = ["tar", "--extract", f"--file={ensure_bytecode()}", "--strip-components=1"]
+    subprocess.run([*unpack, f"--directory={source}"], check=True)
 
 
 @contextmanager

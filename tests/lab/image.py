@@ -14,6 +14,16 @@ CLEAN_PATH = "/opt/lab/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sb
 # Inside the tree while it is built; /run is a tmpfs once it is booted.
 CERTIFICATES = "run/lab-certificates.pem"
 DIFFERENCE = "var/lib/lab/difference.tar"
+FINDER = """\
+import sys
+class Checkout:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name in ("dora_systemd", "dora_systemd.cli"):
+            from importlib.machinery import PathFinder
+            return PathFinder.find_spec(name, ["/src"])
+sys.meta_path.append(Checkout)
+"""
 
 
 def ensure_tree(cache: Path) -> Path:
@@ -83,8 +93,18 @@ def install_checkout(path: Path, log: Path) -> None:
     # No isolation and no dependencies: the build must not need the network, and Debian's are used.
     options = ["--no-deps", "--no-build-isolation", "--quiet"]
     run_in_tree(path, ["pip", "install", *options, "--editable", "/src"], log)
+    replace_finder(path)
     shutil.rmtree(source)
     source.mkdir()
+
+
+def replace_finder(path: Path) -> None:
+    """Every Python loads the finder that pip has written: ten times slower than this one."""
+    (packages,) = path.glob("opt/lab/lib/python3*/site-packages")
+    for old in packages.glob("__editable__*"):
+        old.unlink() if old.is_file() else shutil.rmtree(old)
+    (packages / "lab_checkout.py").write_text(FINDER, encoding="ascii")
+    (packages / "lab_checkout.pth").write_text("import lab_checkout\n", encoding="ascii")
 
 
 def write_difference(path: Path, log: Path) -> None:

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from lab import definition, emulator, qemu
+from lab.bytecode import ensure_bytecode
 from lab.cache import Layer, ensure, ensure_locked, find_cache
 from lab.emulator import emulator_layer, program
 from lab.errors import LabError, Stage
@@ -200,16 +201,18 @@ def run_command(guest: Guest, command: Sequence[str], options: Options) -> int:
 
 def push_checkout(guest: Guest) -> None:
     """And the editable install of it: the snapshot is older than that and outlives it."""
-    difference = ensure_tree(find_cache()) / DIFFERENCE
+    added = ensure_tree(find_cache()) / DIFFERENCE, ensure_bytecode()
     # Its clock may be a second behind this one, and files of the checkout newer than that.
     quiet = ["--ignore-zeros", "--warning=no-timestamp"]
     guest.request(["tar", "--extract", *quiet, "--directory", "/"], resume=True)
     command = pack_command(definition.CHECKOUT, "--transform=flags=rhS;s,^\\.,src,")
     pack = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert pack.stdout
-    with pack, difference.open("rb") as rest:
+    with pack:
         guest.send_pieces(pack.stdout.fileno())
-        guest.send_pieces(rest.fileno())
+        for archive in added:
+            with archive.open("rb") as rest:
+                guest.send_pieces(rest.fileno())
     guest.send(b"I")
     check_packed(pack.returncode)
     check_guest(guest.wait_exit(write_out, write_err), "copy the checkout into")

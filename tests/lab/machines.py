@@ -18,12 +18,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lab import cgroup, image
+from lab import cgroup
 from lab.container import (
     Container,
     enter_command,
     hide_traces,
     nspawn_words,
+    place_checkout,
     start_nspawn,
     wait_ready,
 )
@@ -70,7 +71,7 @@ def run_in_machines(run: Run, tree: Path, options: Options) -> int:
     if len(options.commands) > 1:
         raise LabError("reboot a container", "LAB=vm")
     hide_traces(run)
-    image.copy_checkout(made(run.directory / "src"))
+    place_checkout(run.directory / "src")
     with built(run, tree, options.out) as machines, kept_terminal():
         container = machines[FIRST].container
         assert container
