@@ -1,4 +1,4 @@
-"""`doractl inhibit NAME`: holds a lock while a command runs, or until it is interrupted."""
+"""`doractl inhibit`: lists all locks, or holds one while a command runs or until interrupted."""
 
 import os
 import select
@@ -8,14 +8,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
+from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.inhibit import format_reason
-from dora_systemd.decisions.views.inhibitors import format_holders
+from dora_systemd.decisions.views.inhibitors import Inhibited, format_holders
 from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.locks import find_lock, open_lock, place_of, take_lock, write_reason
-from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.locks import holders_of, read_cell_flocks
+from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.locks import holders_of, read_cell_flocks, read_holders
 from dora_systemd.verbs.start.asked import note_request
 
 RENEW_SECONDS = 1.0
@@ -130,3 +131,13 @@ def _refusal(scope: Scope, cell: Cell) -> DoraSystemdError:
         return DoraSystemdError(message, "try again when that has ended", ExitCode.INHIBITED)
     hint = "it may be starting; if an older version of doractl has started it, restart it"
     return DoraSystemdError(f"cannot inhibit {cell.name}: it has no lock file", hint)
+
+
+def inhibited_dataflows(manager: Manager, scope: Scope) -> list[Inhibited]:
+    """The dataflows whose restart is inhibited, by name."""
+    cells = {cell.name: cell for cell in read_cells(manager) if cell.is_up}
+    found = read_holders(scope, cells)
+    return [
+        Inhibited(name, cells[name].uuid, cells[name].unit, holders)
+        for name, holders in found.items()
+    ]

@@ -1,4 +1,4 @@
-"""The project of a deploy: where it is, and what cannot be deployed."""
+"""The project of a deploy: where it is, what cannot be deployed, and which commands build it."""
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -7,8 +7,8 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
-from dora_systemd.decisions.descriptor.nodes import Node
-from dora_systemd.decisions.releases.build import is_moving
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
+from dora_systemd.decisions.releases.build import built_nodes, has_builds, is_moving, lock_places
 from dora_systemd.decisions.releases.entries import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -16,8 +16,9 @@ from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import Text, read_file
 from dora_systemd.trust.paths import Place, exists, is_directory
+from dora_systemd.trust.sight import Sight, sight_of
 from dora_systemd.values import shown
-from dora_systemd.verbs.releases.builders import find_builders
+from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan, path_of
 
 
@@ -252,3 +253,36 @@ def _is_below(path: str, directory: str) -> bool:
 
 def _refusal(reason: str, hint: str) -> DoraSystemdError:
     return DoraSystemdError(f"cannot deploy: {reason}", hint, ExitCode.BAD_INPUT)
+
+
+def find_builders(plan: Plan, dataflow: Dataflow, root: str) -> tuple[str, str]:
+    """The paths of dora and of uv, "" for one that has nothing to do.
+
+    dataflow: of the plan, as written. root: of the project.
+    """
+    has_nodes = bool(built_nodes(dataflow))
+    modules = [node.raw.get("module") for node in dataflow.nodes if node.kind is NodeKind.MODULE]
+    relative = os.path.relpath(plan.options.dataflow, root)
+    is_locked = any(exists(f"{root}/{place}") for place in lock_places(relative))
+    is_given = plan.settings.is_given(VENV)
+    uv = ""
+    if modules or (is_locked and not is_given):
+        with sight_of(account_of(plan.user)) as sight:
+            directory = Path(plan.options.dataflow).parent
+            has_nodes = has_nodes or any(_has_builds(directory, one, sight) for one in modules)
+            uv = _find_uv(plan, sight) if is_locked and not is_given else ""
+    return plan.options.dora if has_nodes else "", uv
+
+
+def _has_builds(directory: Path, module: object, sight: Sight) -> bool:
+    """Whether the file of a module asks for a build; dora reports one that is not readable."""
+    path = directory / str(module)
+    try:
+        return has_builds(parse_yaml(decoded(sight.read(str(path)), path), path))
+    except (OSError, DoraSystemdError):
+        return False
+
+
+def _find_uv(plan: Plan, sight: Sight) -> str:
+    places = plan.environment.get("PATH", "").split(os.pathsep)
+    return next((one for one in (f"{at}/uv" for at in places if at) if sight.is_program(one)), "")

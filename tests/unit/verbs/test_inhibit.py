@@ -20,8 +20,7 @@ from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited, uninhibited
-from dora_systemd.verbs.inhibit.hold import Lock, hold, take_inhibiting
-from dora_systemd.verbs.inhibit.list import inhibited_dataflows
+from dora_systemd.verbs.inhibit.hold import Lock, hold, inhibited_dataflows, take_inhibiting
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
 
