@@ -76,9 +76,11 @@ def _values(
 ) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for fact in facts:
-        value = fact.value(fact.of(row))
-        values |= moment(fact.key, value) if fact.is_moment else {fact.key: value}
-    return {**values, "waits_percent": shares or None}
+        if fact.is_moment:
+            values |= moment(fact.key, fact.of(row))
+        else:
+            values[fact.key] = fact.value(fact.of(row))
+    return values | {"waits_percent": shares or None}
 
 
 def error_object(error: DoraSystemdError) -> dict[str, Any]:
