@@ -58,8 +58,12 @@ class WrongKey(DoraSystemdError):
 
     def at_line(self, line: int) -> DoraSystemdError:
         """The error with the number of the line, which is 0 if it is not known."""
-        where = f" at line {line}" if line else ""
-        return DoraSystemdError(f"{self.message}{where}", self.hint, self.code)
+        if not line:
+            return self
+        # A place in parentheses has it inside: (memory_limit in robot.systemd.yml at line 2).
+        end = ")" * self.message.endswith(")")
+        message = f"{self.message.removesuffix(end)} at line {line}{end}"
+        return DoraSystemdError(message, self.hint, self.code)
 
 
 class TimedOut(DoraSystemdError):

@@ -41,7 +41,8 @@ def _key() -> str:
     texts = hashlib.sha256()
     for folder in FOLDERS:
         for path in sorted((definition.CHECKOUT / folder).rglob("*.py")):
-            texts.update(f"{path}\n".encode() + path.read_bytes())
+            name = path.relative_to(definition.CHECKOUT)
+            texts.update(f"{name}\n".encode() + path.read_bytes())
     return definition.digest(
         definition.tree_key(), definition.read_part(Path(__file__)), texts.hexdigest()
     )

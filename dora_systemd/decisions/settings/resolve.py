@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.settings.kinds import Base, Setting
 from dora_systemd.decisions.settings.table import SETTINGS
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
 from dora_systemd.values import shown
 
 T = TypeVar("T")
@@ -152,10 +152,15 @@ def _from_files(
             yield source, _parsed_in_file(setting, document[setting.name], source, setting.name)
 
 
-def _parsed_in_file(setting: Setting[Any], value: object, source: str, key: str) -> Any:
+def _parsed_in_file(setting: Setting[Any], value: object, source: str, *place: str) -> Any:
     base = PurePath(source).parent
-    where = f"{key} in {shown(source)}"
-    return _parsed(setting, value, where, ExitCode.BAD_INPUT, base if base.is_absolute() else None)
+    where = f"{'.'.join(place)} in {shown(source)}"
+    try:
+        return _parsed(
+            setting, value, where, ExitCode.BAD_INPUT, base if base.is_absolute() else None
+        )
+    except DoraSystemdError as error:
+        raise WrongKey(error.message, error.hint, source, place) from error
 
 
 def _parsed(
@@ -187,7 +192,6 @@ def _resolve_nodes(
     for source, document in reversed(documents):
         for node, values in document.get("nodes", {}).items():
             for name, value in (values or {}).items():
-                key = f"nodes.{node}.{name}"
-                parsed = _parsed_in_file(settings[name], value, source, key)
+                parsed = _parsed_in_file(settings[name], value, source, "nodes", node, name)
                 nodes.setdefault(node, {})[name] = parsed
     return nodes
