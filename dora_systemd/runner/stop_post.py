@@ -1,4 +1,4 @@
-"""Writes the end of a dataflow to the journal after its runner was killed.
+"""Writes the end of a dataflow to the journal if its runner could not.
 
 ExecStopPost= of the unit runs `python3 -m dora_systemd.runner.stop_post NAME UUID`. A killed runner
 leaves lines in the nodes' pipes, which systemd keeps open (adapters/host/fd_store.py), and no event
@@ -42,25 +42,34 @@ STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
 def main(argv: list[str]) -> int:
-    """Kill the nodes, and write their last lines and the event dataflow-failed."""
+    """Kill the nodes, and write their last lines and how the dataflow has ended."""
     deadline = time.monotonic() + ALL_SECONDS
     (cause, reason), directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
-    if not reason or len(argv) != 2 or not directory:
+    if len(argv) != 2 or not directory:
+        return 0
+    if was_stopped_early(os.environ):
+        write_last_words(argv[0], argv[1], Path(directory), "dataflow-stopped", {})
+    if not reason:
         return 0
     unit = unit_group()
     details = {"reason": reason, "cause": cause, **out_of_memory(unit)}
     with contextlib.suppress(OSError):
         kill_nodes(unit, KILL_SECONDS)
     left = deadline - time.monotonic()
-    write_last_words(argv[0], argv[1], Path(directory), details, seconds=left)
+    write_last_words(argv[0], argv[1], Path(directory), "dataflow-failed", details, seconds=left)
     return 0
+
+
+def was_stopped_early(environ: Mapping[str, str]) -> bool:
+    """Whether SIGTERM has ended the runner, which has no handler for it in its first moments."""
+    return (environ.get("EXIT_CODE"), environ.get("SERVICE_RESULT")) == ("killed", "success")
 
 
 def killed_by(environ: Mapping[str, str]) -> tuple[Cause, str]:
     """How the runner was killed, see EXIT_CODE in systemd.exec(5); "" if it exited by itself."""
     result = environ.get("SERVICE_RESULT", "")
-    # Success: SIGTERM before the runner had its handler: stopped right after the start.
-    if environ.get("EXIT_CODE", "") not in ("killed", "dumped") or result == "success":
+    is_killed = environ.get("EXIT_CODE", "") in ("killed", "dumped")
+    if not is_killed or was_stopped_early(environ):
         return Cause.RUNNER_KILLED, ""
     killed = f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
     return UNIT_RESULTS.get(result, (Cause.RUNNER_KILLED, killed))
@@ -70,11 +79,12 @@ def write_last_words(
     name: str,
     uuid: str,
     directory: Path,
+    event: str,
     details: Mapping[str, str],
     journal_socket: str = "",
     seconds: float = ALL_SECONDS,
 ) -> None:
-    """Write the content of the pipes below `directory`, and that the dataflow failed.
+    """Write the content of the pipes below `directory`, and the event of the end.
 
     details: of that event. journal_socket: another socket than journald's, for tests. seconds:
     timeout for everything.
@@ -104,7 +114,7 @@ def write_last_words(
                 pipes.replay(path.stem, path)
                 pipes.drain(path.stem)
         read_logs_of_dora(loop, pipes, paths.io, min(DAEMON_SECONDS, seconds / 2))
-    pipes.write_event("dataflow-failed", **details)
+    pipes.write_event(event, **details)
     pipes.close(max(deadline - time.monotonic() - READ_SECONDS, 0.0))
     journal.wait_read(READ_SECONDS)
     journal.close()

@@ -168,6 +168,24 @@ def test_a_running_dataflow_is_enabled_and_runs_on(boots: Cell, project: Project
 
 
 @pytest.mark.usefixtures("target")
+@pytest.mark.warns("Main process exited", "Failed with result", "supervisor process was killed")
+def test_a_stop_in_the_first_moments_of_a_life(boots: Cell, project: Project) -> None:
+    """It has no handler for SIGTERM yet; the crash before that is not how it has ended."""
+    boots.start(project.three_nodes(), "--enable")
+    boots.systemctl("kill", "--signal=KILL", "--kill-whom=main")
+    wait_for("it has failed", lambda: boots.show("ActiveState") == "failed")
+    assert ("dataflow-failed", "") in boots.events()
+    boots.systemctl("start", "--no-block")
+    wait_for("a process", lambda: boots.show("MainPID") != "0")
+    boots.systemctl("stop")
+    rows = json.loads(boots.doractl("list", "--all", "-o", "json").stdout)
+    (listed,) = [row["status"] for row in rows if row["name"] == boots.name]
+    explained = json.loads(boots.doractl("why", boots.name, "-o", "json").stdout)["status"]
+    assert (listed, explained) == ("Stopped", "Stopped")
+    assert boots.events()[-1] == ("dataflow-stopped", "")
+
+
+@pytest.mark.usefixtures("target")
 def test_a_reload_in_between_changes_nothing(boots: Cell, project: Project) -> None:
     """The target holds the transient unit then; doractl has it forgotten."""
     flow = project.three_nodes()

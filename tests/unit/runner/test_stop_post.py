@@ -17,6 +17,7 @@ from dora_systemd.runner.stop_post import (
     killed_by,
     main,
     out_of_memory,
+    was_stopped_early,
     write_last_words,
 )
 from dora_systemd.values import SECOND
@@ -93,12 +94,13 @@ def test_by_hand() -> None:
     assert main(["robot", UUID]) == 0
 
 
-def last_words(directory: Path) -> list[bytes]:
+def last_words(directory: Path, event: str = "dataflow-failed") -> list[bytes]:
     """The entries that are written for a runner that ran in `directory`."""
     path = directory / "socket"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as server:
         server.bind(str(path))
-        write_last_words("robot", UUID, directory, {"reason": "killed"}, str(path))
+        details = {"reason": "killed"} if event == "dataflow-failed" else {}
+        write_last_words("robot", UUID, directory, event, details, str(path))
         entries = []
         while True:
             try:
@@ -126,6 +128,26 @@ def test_last_words(tmp_path: Path) -> None:
 def test_runtime_directory_is_empty(tmp_path: Path) -> None:
     (event,) = last_words(tmp_path)
     assert b"DORA_EVENT=dataflow-failed\n" in event
+
+
+def test_a_stop_in_the_first_moments_is_recorded(tmp_path: Path) -> None:
+    (event,) = last_words(tmp_path, "dataflow-stopped")
+    assert b"MESSAGE=Dataflow robot was stopped\n" in event
+
+
+@pytest.mark.parametrize(
+    ("code", "result", "is_early"),
+    [
+        ("killed", "success", True),
+        ("killed", "signal", False),
+        ("exited", "success", False),
+        ("dumped", "core-dump", False),
+        ("", "", False),
+    ],
+)
+def test_only_sigterm_before_the_handler_is_early(code: str, result: str, is_early: bool) -> None:
+    environ = {"EXIT_CODE": code, "EXIT_STATUS": "TERM", "SERVICE_RESULT": result}
+    assert was_stopped_early(environ) == is_early
 
 
 def test_no_python_is_started_after_a_runner_that_ended_by_itself() -> None:
