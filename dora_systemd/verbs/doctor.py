@@ -29,11 +29,12 @@ from dora_systemd.decisions.views.diagnosis import (
     judge_port,
     judge_processes,
     judge_rate,
+    judge_storage,
     judge_systemd,
 )
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.decisions.views.real_time import judge_cpuset, judge_real_time
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope
 from dora_systemd.trust.paths import exists
@@ -185,23 +186,27 @@ def _is_down(manager: Manager, unit: str) -> bool:
 
 
 def _journal(scope: Scope, _root: Path) -> Iterator[Finding]:
-    try:
-        journal_reader.check_readable(scope)
-    except DoraSystemdError as error:
-        yield Finding("journal", State.WARNING, error.message, error.hint)
-    if journal_reader.is_volatile():
-        text = "it is kept in memory and lost at a reboot"
-        remedy = "as root: mkdir /var/log/journal and systemctl restart systemd-journald"
-        yield Finding("journal", State.WARNING, text, remedy)
-    else:
-        yield Finding("journal", State.OK, "it survives a reboot")
     command = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
     try:
         config = run_command(command, _SECONDS).stdout
     except DoraSystemdError as error:
-        yield Finding("log rate", State.NOTE, error.message)
+        config, rate = "", Finding("log rate", State.NOTE, error.message)
     else:
-        yield judge_rate(config, scope.is_user)
+        rate = judge_rate(config, scope.is_user)
+    yield from _storage(scope, judge_storage(config, not journal_reader.is_volatile()))
+    yield rate
+
+
+def _storage(scope: Scope, kept: Finding) -> Iterator[Finding]:
+    try:
+        journal_reader.check_readable(scope)
+    except DoraSystemdError as error:
+        is_missing = error.code is ExitCode.NO_SYSTEMD
+        if not (is_missing and "Storage=none" in kept.text):
+            yield Finding("journal", State.WARNING, error.message, error.hint)
+        if is_missing and "Storage=none" not in kept.text:
+            return  # no journal: nothing is kept in memory either
+    yield kept
 
 
 def _dora(_scope: Scope, _root: Path) -> Iterator[Finding]:
