@@ -150,10 +150,11 @@ class Driver:
     def _look(self, at: int) -> Look:
         """One that saw nothing change, if such a one can be had."""
         for _ in range(LOOKS):
-            is_quiet, before = _becomes_quiet(), _states()
+            root = self.scene.root
+            is_quiet, before = _becomes_quiet(root), _states(root)
             metrics = self.scene.front.get("/metrics").body
             cells = {cell: view_of(cell, metrics) for cell in CELLS}
-            if before == _states() or not is_quiet:
+            if before == _states(root) or not is_quiet:
                 break
         else:
             is_quiet = False
@@ -189,13 +190,13 @@ def _ran(cell: str) -> tuple[dict[str, Any], ...]:
     return tuple(json.loads(done.stdout)[::-1]) if done.returncode == 0 else ()
 
 
-def _becomes_quiet() -> bool:
+def _becomes_quiet(root: Path) -> bool:
     """Whether nothing changes any more, within the bound; twice the same is quiet."""
     last: list[dict[str, str]] = []
 
     def is_quiet() -> bool:
         nonlocal last
-        now = _states()
+        now = _states(root)
         is_same, last = now == last, now
         return is_same and all(map(_is_steady, now))
 
@@ -205,11 +206,11 @@ def _becomes_quiet() -> bool:
         return False
 
 
-def _states() -> list[dict[str, str]]:
-    return [_state_of(cell) for cell in CELLS]
+def _states(root: Path) -> list[dict[str, str]]:
+    return [_state_of(cell, root / cell / "project") for cell in CELLS]
 
 
-def _state_of(cell: str) -> dict[str, str]:
+def _state_of(cell: str, project: Path) -> dict[str, str]:
     found = properties(f"dora-{cell}.service")
     status = None
     with contextlib.suppress(FileNotFoundError):  # its directory goes with the dataflow
@@ -219,7 +220,17 @@ def _state_of(cell: str) -> dict[str, str]:
     # A node can have died a moment before the runner hears of it.
     found["pids"] = str({at: one for at, one in pids_of(found).items() if at.startswith("node-")})
     found["stage"] = status.stage if status else ""
+    found["old"] = "yes" * _has_old_directory(project / "node.py", found["MainPID"])
     return found
+
+
+def _has_old_directory(file: Path, pid: str) -> bool:
+    """Whether another directory has the name of the project since the start.
+
+    The old one is mounted for the nodes, and empty. dora tries in vain to restart one of them until
+    somebody restarts the dataflow.
+    """
+    return file.exists() and pid != "0" and not Path(f"/proc/{pid}/root{file}").exists()
 
 
 def _word(node: NodeStatus) -> str:
@@ -233,4 +244,5 @@ def _is_steady(state: dict[str, str]) -> bool:
     if state["ActiveState"] in ("inactive", "failed"):
         return True
     is_up = state["ActiveState"] == "active" and state["stage"] in ("running", "degraded")
-    return is_up and set(state["nodes"].split()) <= ALIVE
+    steady = ALIVE | {"restarting"} if state["old"] else ALIVE
+    return is_up and set(state["nodes"].split()) <= steady

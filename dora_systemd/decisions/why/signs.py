@@ -34,6 +34,11 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
         f"/tmp is private in the sandbox: --writable /tmp shares the one of the machine, {_MORE}",
     ),
     (
+        ("can't open file '/",),
+        "its file is not where it was: if somebody has replaced or removed its directory since the "
+        "start, only a restart of the dataflow finds the new one",
+    ),
+    (
         ("Operation not permitted", "Address family not supported", "EPERM"),
         f"the sandbox may have refused that; try --sandbox none, {_MORE}",
     ),
