@@ -76,6 +76,7 @@ def _show_life() -> None:
         _type(f"doractl why {NAME}")
     _say("the cable is in again")
     flow.wait_exchanging()
+    _wait_measured(flow)  # what the head knows of b is up to a second old
     _type("doractl list")
     _type(f"doractl why {NAME}")
     _type(f"doractl why {NAME}", on="b")
