@@ -29,14 +29,14 @@ from dora_systemd.decisions.views.diagnosis import (
     judge_port,
     judge_processes,
     judge_rate,
-    judge_storage,
     judge_systemd,
 )
 from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.decisions.views.journal import Place, judge_journal, storage_of
 from dora_systemd.decisions.views.real_time import judge_cpuset, judge_real_time
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
-from dora_systemd.scope import RUNTIME_NAME, Scope
+from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of
 from dora_systemd.trust.paths import exists
 from dora_systemd.trust.socket_table import TABLES, listening_sockets
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
@@ -49,7 +49,11 @@ from dora_systemd.verbs.start.linger import is_lingering, linger_command
 from dora_systemd.verbs.start.logins import PASSWD, judge_logins
 from dora_systemd.verbs.start.settings import check_config, config_files
 
+JOURNALD = "systemd-journald.service"
+
 _SECONDS = 20.0
+_STARTED = "ExecMainStartTimestamp"
+_JOURNALD_CONFIG = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
 _BROKEN = ("bad-setting", "error")
 
 
@@ -65,6 +69,7 @@ def examine(
     else:
         found = [judge_systemd(version)]
         found += [one for check in _WITH_SYSTEMD for one in guarded(check, manager, scope, root)]
+    found += _journal(reach, scope)
     return found + [one for check in _WITHOUT for one in check(scope, root)]
 
 
@@ -185,28 +190,35 @@ def _is_down(manager: Manager, unit: str) -> bool:
     return manager.read(unit, ["ActiveState"])["ActiveState"] in DOWN
 
 
-def _journal(scope: Scope, _root: Path) -> Iterator[Finding]:
-    command = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
-    try:
-        config = run_command(command, _SECONDS).stdout
-    except DoraSystemdError as error:
-        config, rate = "", Finding("log rate", State.NOTE, error.message)
-    else:
-        rate = judge_rate(config, scope.is_user)
-    yield from _storage(scope, judge_storage(config, not journal_reader.is_volatile()))
-    yield rate
-
-
-def _storage(scope: Scope, kept: Finding) -> Iterator[Finding]:
+def _journal(reach: Callable[[Scope], Manager], scope: Scope) -> Iterator[Finding]:
+    config = _journald_config()
+    place = _journal_place(reach)
     try:
         journal_reader.check_readable(scope)
     except DoraSystemdError as error:
-        is_missing = error.code is ExitCode.NO_SYSTEMD
-        if not (is_missing and "Storage=none" in kept.text):
+        if place is Place.UNKNOWN or error.code is not ExitCode.NO_SYSTEMD:  # else it says the same
             yield Finding("journal", State.WARNING, error.message, error.hint)
-        if is_missing and "Storage=none" not in kept.text:
-            return  # no journal: nothing is kept in memory either
-    yield kept
+    yield judge_journal(place, storage_of("" if isinstance(config, Finding) else config))
+    yield config if isinstance(config, Finding) else judge_rate(config, scope.is_user)
+
+
+def _journal_place(reach: Callable[[Scope], Manager]) -> Place:
+    """Where the system's journald has written since it was started."""
+    try:
+        facts = reach(scope_of(is_user=False)).read(JOURNALD, ["ActiveState", _STARTED])
+    except DoraSystemdError:
+        return Place.UNKNOWN
+    if facts["ActiveState"] in DOWN:
+        return Place.STOPPED
+    return journal_reader.place_since(int(facts[_STARTED]))
+
+
+def _journald_config() -> str | Finding:
+    """The text of journald.conf and its drop-ins, or the finding that it is not known."""
+    try:
+        return run_command(_JOURNALD_CONFIG, _SECONDS).stdout
+    except DoraSystemdError as error:
+        return Finding("log rate", State.NOTE, error.message)
 
 
 def _dora(_scope: Scope, _root: Path) -> Iterator[Finding]:
@@ -269,4 +281,4 @@ def _below(root: Path, path: Path) -> Path:
 
 
 _WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports, _releases)
-_WITHOUT = (_journal, _dora, _user, _logins, _settings, _processes, _real_time)
+_WITHOUT = (_dora, _user, _logins, _settings, _processes, _real_time)

@@ -50,6 +50,31 @@ def test_a_user() -> None:
     assert of("linger", found)[0]["state"] == "ok"
 
 
+def test_a_journal_that_keeps_nothing() -> None:
+    """The files of before are still there; root and a user are told the same."""
+    user = ("runuser", "-u", "alice", "--", "env", "XDG_RUNTIME_DIR=/run/user/1000")
+    drop_in = Path("/etc/systemd/journald.conf.d/50-storage.conf")
+    drop_in.parent.mkdir(exist_ok=True)
+
+    def told(storage: str) -> str:
+        drop_in.write_text(f"[Journal]\nStorage={storage}\n")
+        run("systemctl", "restart", "systemd-journald")
+        run("journalctl", "--flush")
+        # Before this, a user may be told that the records cannot be read.
+        one, other = (of("journal", findings(*caller))[-1] for caller in ((), user))
+        assert one == other
+        return f"{one['state']}: {one['text']}"
+
+    try:
+        assert told("none") == "warning: no line is kept: journald has Storage=none"
+        assert told("volatile") == "warning: it is kept in memory and lost at a reboot"
+        assert told("persistent") == "ok: it survives a reboot"
+    finally:
+        drop_in.unlink()
+        run("systemctl", "restart", "systemd-journald")
+        run("journalctl", "--flush")
+
+
 def test_without_systemd() -> None:
     """The rest is still looked at."""
     hidden = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs none /run && exec "$@"', "sh")

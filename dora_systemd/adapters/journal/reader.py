@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice, takewhile
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from dora_systemd.decisions.logs.query import (
     scope_matches,
     start_matches,
 )
+from dora_systemd.decisions.views.journal import Place
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
 from dora_systemd.scope import Scope
@@ -31,6 +33,7 @@ ROOT = Path("/")
 """The directory with all files of the machine."""
 _PERSISTENT = "var/log/journal"
 _VOLATILE = "run/log/journal"
+_PLACES = {_VOLATILE: Place.MEMORY, _PERSISTENT: Place.DISK}
 
 _LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
 _LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
@@ -258,7 +261,32 @@ def _system_files(top: Path) -> list[Path]:
 
 def is_volatile(root: Path | None = None) -> bool:
     """Whether the journal is lost at a reboot, see Storage= in journald.conf(5). root: as ROOT."""
-    return not _system_files((root or ROOT) / _PERSISTENT)
+    return not _newest(root or ROOT, _PERSISTENT) > _newest(root or ROOT, _VOLATILE)
+
+
+def place_since(start_us: int, root: Path | None = None) -> Place:
+    """Where journald has written since its start, CLOCK_REALTIME µs. root: as ROOT.
+
+    It writes a record when it starts, and sets the time of a file that it has written to.
+    """
+    found = {_newest(root or ROOT, one): place for one, place in _PLACES.items()}
+    newest = max(found)
+    return found[newest] if newest >= start_us else Place.NOWHERE
+
+
+def _newest(root: Path, top: str) -> float:
+    """When the newest system journal file there was written; without one, before all times.
+
+    A file that cannot be looked at is believed to be in use.
+    """
+    return max(map(_written_us, _system_files(root / top)), default=-inf)
+
+
+def _written_us(path: Path) -> float:
+    try:
+        return path.stat().st_mtime_ns // 1000
+    except OSError:
+        return inf
 
 
 def check_readable(scope: Scope, root: Path | None = None) -> None:

@@ -21,8 +21,6 @@ DORA_PORTS = {
 _CELL = re.compile(r"/dora-[^/]+\.service(/|$)")
 _ENGINES = ("coordinator", "daemon")
 _MAX_COMMAND = 80
-_STORAGES = ("none", "volatile", "auto", "persistent")
-_PERSIST = "Storage=persistent in journald.conf(5) and systemctl restart systemd-journald"
 _RATE_DEFAULTS = {"RateLimitIntervalSec": "30s", "RateLimitBurst": "10000"}
 
 
@@ -98,24 +96,6 @@ def judge_rate(config: str, is_user: bool) -> Finding:
     text = f"journald takes {rate} from all services of a user together and drops the rest"
     remedy = "as root, for more: RateLimitBurst= in journald.conf(5), or use --system"
     return Finding("log rate", State.NOTE, text, remedy)
-
-
-def judge_storage(config: str, has_files: bool) -> Finding:
-    """Where journald keeps what it takes now. config: as judge_rate. has_files: in /var/log."""
-    words = re.findall(r"^[ \t]*Storage[ \t]*=[ \t]*(\S*)", config, flags=re.M)
-    # journald ignores a word that it does not know. Files may be older than the setting.
-    storage = next((word for word in reversed(words) if word in _STORAGES), "auto")
-    if storage == "none":
-        text = "journald keeps nothing: Storage=none"
-        return Finding("journal", State.WARNING, text, f"as root: {_PERSIST}")
-    if storage == "volatile":
-        text = "it is kept in memory and lost at a reboot: Storage=volatile"
-        return Finding("journal", State.WARNING, text, f"as root: {_PERSIST}")
-    if not has_files:
-        text = "it is kept in memory and lost at a reboot"
-        remedy = "as root: mkdir /var/log/journal and systemctl restart systemd-journald"
-        return Finding("journal", State.WARNING, text, remedy)
-    return Finding("journal", State.OK, "it survives a reboot")
 
 
 def judge_port(port: int, owners: Sequence[Process], is_used: bool) -> Finding:

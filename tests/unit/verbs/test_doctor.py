@@ -13,7 +13,7 @@ from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.doctor import examine, guarded
+from dora_systemd.verbs.doctor import JOURNALD, examine, guarded
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
@@ -24,6 +24,7 @@ from tests.unit.verbs.start.test_claim import make_plan, place
 @pytest.fixture
 def manager(manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeManager:
     """A machine where all is well. Its files are below tmp_path."""
+    manager.units[JOURNALD] = {"ActiveState": "active", "ExecMainStartTimestamp": 1}
     manager.units["dora.target"] = {"LoadState": "loaded", "WantedBy": ["multi-user.target"]}
     mount = fake_cgroups(monkeypatch, tmp_path)
     (mount / "cgroup.controllers").write_text("cpu cpuset io memory pids\n")
@@ -78,6 +79,41 @@ def test_without_systemd(manager: FakeManager, scope: Scope) -> None:
     first, *rest = examine(reach, scope)
     assert first == Finding("systemd", State.PROBLEM, "cannot reach systemd", "boot with it")
     assert {one.topic for one in rest} >= {"journal", "dora", "bare dora"}
+
+
+def journal_lines(manager: FakeManager, scope: Scope) -> list[str]:
+    return [f"{one.state}: {one.text}" for one in look(manager, scope) if one.topic == "journal"]
+
+
+def test_files_of_an_earlier_journal_prove_nothing(
+    manager: FakeManager, scope: Scope, tmp_path: Path
+) -> None:
+    """journald was restarted with another Storage=; the user's scope asks the system's journald."""
+    config = tmp_path / "bin/systemd-analyze"
+    old = tmp_path / "var/log/journal/machine/system.journal"
+    manager.units[JOURNALD]["ExecMainStartTimestamp"] = old.stat().st_mtime_ns // 1000 + 1
+    make_program(config, "printf '[Journal]\\nStorage=auto\\n[Journal]\\n Storage = none\\n'")
+    user = ScopeIn(is_user=True, uid=0, root=tmp_path / "run")
+    for asked in (scope, user):
+        (line,) = journal_lines(manager, asked)
+        assert line == "warning: no line is kept: journald has Storage=none"
+    make_program(config, "printf '[Journal]\\nStorage=volatile\\n'")
+    new = tmp_path / "run/log/journal/machine/system.journal"
+    new.parent.mkdir(parents=True)
+    new.touch()
+    os.utime(new, ns=(0, old.stat().st_mtime_ns + 2000))
+    (line,) = journal_lines(manager, scope)
+    assert line == "warning: it is kept in memory and lost at a reboot"
+
+
+def test_without_journald_one_line_says_so(
+    manager: FakeManager, scope: Scope, tmp_path: Path
+) -> None:
+    manager.units[JOURNALD]["ActiveState"] = "inactive"
+    for _ in range(2):  # with old files, and without any
+        (line,) = journal_lines(manager, scope)
+        assert line == "warning: systemd-journald does not run: no line is kept"
+        (tmp_path / "var/log/journal/machine/system.journal").unlink(missing_ok=True)
 
 
 def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from dora_systemd.decisions.views.diagnosis import (
     judge_port,
     judge_processes,
     judge_rate,
-    judge_storage,
     judge_systemd,
 )
 from dora_systemd.decisions.views.findings import (
@@ -64,27 +63,6 @@ def test_controllers() -> None:
 )
 def test_rate(config: str, is_user: bool, state: State, part: str) -> None:
     found = judge_rate(config, is_user)
-    assert found.state is state
-    assert part in found.text
-
-
-@pytest.mark.parametrize(
-    ("config", "has_files", "state", "part"),
-    [
-        ("", True, State.OK, "survives"),
-        ("", False, State.WARNING, "in memory"),
-        ("#Storage=none\n", True, State.OK, "survives"),
-        ("Storage=none\n", True, State.WARNING, "keeps nothing"),
-        ("Storage=none\n", False, State.WARNING, "keeps nothing"),
-        ("Storage=volatile\n", True, State.WARNING, "in memory"),
-        ("Storage=none\nStorage=persistent\n", True, State.OK, "survives"),
-        ("Storage=volatile\nStorage=x\n", True, State.WARNING, "in memory"),
-    ],
-)
-def test_old_files_do_not_say_that_the_journal_is_kept(
-    config: str, has_files: bool, state: State, part: str
-) -> None:
-    found = judge_storage(config, has_files)
     assert found.state is state
     assert part in found.text
 
