@@ -39,8 +39,10 @@ def doractl(*words: str) -> subprocess.CompletedProcess[str]:
 def test_one_host(cell: Cell, project: Project) -> None:
     """What a host prints, and its exit statuses, as they are there."""
     flow = str(project.three_nodes())
-    started = run("doractl", "-H", "base", "start", flow, "--name", cell.name)
+    given = ("--name", cell.name, "--uid", "alice")
+    started = run("doractl", "-H", "base", "start", flow, *given)
     assert f"Unit: {cell.unit}\n" in started.stdout
+    assert run("systemctl", "show", cell.unit, "--value", "-p", "User").stdout == "alice\n"
     far, near = (json.loads(run(*words, "show", cell.name, "-o", "json").stdout) for words in (
         ("doractl", "-H", "root@base"), ("doractl",)
     ))  # fmt: skip
