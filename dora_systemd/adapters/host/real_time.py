@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,10 @@ from dora_systemd.errors import DoraSystemdError
 _CPUS = "sys/devices/system/cpu"
 _CONFIGS = ("proc/config.gz", f"boot/config-{os.uname().release}")
 _OPTION = "CONFIG_RT_GROUP_SCHED"
+_AT_BOOT = re.compile(r"\brt_group_sched=([01])\b")
+_CONTROLLERS = "sys/fs/cgroup/cgroup.controllers"
+_BOUNDING = re.compile(r"^CapBnd:\s*([0-9a-f]+)$", re.M)
+_CAP_SYS_RESOURCE = 1 << 24
 _MOST_BYTES = 4 * 1024 * 1024
 _GZIP = 16 + zlib.MAX_WBITS
 _SECONDS = 10.0
@@ -28,15 +33,30 @@ def read_real_time(root: Path = Path("/")) -> RealTime:
     return RealTime(
         has_groups=_has_groups(root),
         is_granted=_can_run(root, _REALTIME),
-        can_raise=_can_run(root, _LIMIT),
+        can_raise=_can_raise(root),
         isolated=_text(root / _CPUS / "isolated"),
         governors=_governors(root / _CPUS),
     )
 
 
 def _has_groups(root: Path) -> bool | None:
+    """Whether groups with the cpu controller on have no realtime, see sched-rt-group of Linux."""
     lines = next(filter(None, (_config(root / one) for one in _CONFIGS)), "").splitlines()
-    return f"{_OPTION}=y" in lines if lines else None
+    if not lines:
+        return None
+    said = _AT_BOOT.findall(_text(root / "proc/cmdline"))
+    is_on = said[-1] == "1" if said else f"{_OPTION}_DEFAULT_DISABLED=y" not in lines
+    controllers = root / _CONTROLLERS
+    is_used = not controllers.exists() or "cpu" in _text(controllers).split()
+    return f"{_OPTION}=y" in lines and is_on and is_used
+
+
+def _can_raise(root: Path) -> bool | None:
+    """Whether PID 1 could raise limits: what it may not, no service gets. None: not known."""
+    bounding = _BOUNDING.search(_text(root / "proc/1/status"))
+    if bounding and not int(bounding[1], 16) & _CAP_SYS_RESOURCE:
+        return False
+    return _can_run(root, _LIMIT)
 
 
 def _config(path: Path) -> str:

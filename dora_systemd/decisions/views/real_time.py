@@ -14,9 +14,9 @@ _BEST_GOVERNOR = "performance"
 class RealTime:
     """What decides about real time on this machine.
 
-    has_groups: whether the kernel was built with CONFIG_RT_GROUP_SCHED; None: not known.
-    is_granted: whether root could have a realtime priority; None: nobody tried, or not as root.
-    can_raise: the same for higher limits.
+    has_groups: whether CONFIG_RT_GROUP_SCHED of the kernel keeps realtime from the group of a node,
+    whatever root may have in its own; None: not known. is_granted: whether root could have a
+    realtime priority; None: nobody tried, or not as root. can_raise: the same for higher limits.
     isolated: list of isolated CPUs, or "". governors: of the CPU frequency, without double ones.
     """
 
@@ -46,19 +46,17 @@ def judge_real_time(facts: RealTime) -> Iterator[Finding]:
 
 
 def _scheduling(facts: RealTime) -> Finding:
-    is_possible = facts.is_granted or (facts.is_granted is None and not facts.has_groups)
-    if is_possible and facts.can_raise is False:  # the limit of the unit stays 0
+    if facts.can_raise is False:  # the limit of the unit stays 0
         text = f"not even root can raise the limit of realtime priorities: {_REFUSED}"
         return Finding(TOPIC, State.NOTE, text, "a container needs CAP_SYS_RESOURCE for it")
-    if is_possible:
-        return Finding(TOPIC, State.OK, "nodes can have realtime scheduling, if root gives it")
     if facts.has_groups:
         text = f"the kernel has CONFIG_RT_GROUP_SCHED: {_REFUSED}"
         remedy = "boot with rt_group_sched=0 (Linux 6.16 and newer), or use another kernel"
-    else:
+        return Finding(TOPIC, State.NOTE, text, remedy)
+    if facts.is_granted is False:
         text = f"this machine refuses realtime scheduling even to root: {_REFUSED}"
-        remedy = "a container needs CAP_SYS_NICE for it"
-    return Finding(TOPIC, State.NOTE, text, remedy)
+        return Finding(TOPIC, State.NOTE, text, "a container needs CAP_SYS_NICE for it")
+    return Finding(TOPIC, State.OK, "nodes can have realtime scheduling, if root gives it")
 
 
 def judge_cpuset(available: Collection[str], is_user: bool) -> Finding:

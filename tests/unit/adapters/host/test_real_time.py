@@ -46,6 +46,40 @@ def test_its_kernel(machine: Path, name: str, is_on: bool) -> None:
     assert read_real_time(machine).has_groups is is_on
 
 
+@pytest.mark.parametrize(
+    ("config", "cmdline", "controllers", "has_groups"),
+    [
+        ("", "quiet", "cpu memory", True),
+        ("", "rt_group_sched=1 rt_group_sched=0", "cpu", False),
+        ("CONFIG_RT_GROUP_SCHED_DEFAULT_DISABLED=y\n", "quiet", "cpu", False),
+        ("CONFIG_RT_GROUP_SCHED_DEFAULT_DISABLED=y\n", "rt_group_sched=1", "cpu", True),
+        ("", "quiet", "memory pids", False),
+    ],
+)
+def test_where_groups_matter(
+    machine: Path, config: str, cmdline: str, controllers: str, has_groups: bool
+) -> None:
+    """Root's own group tells nothing of that of a node."""
+    (machine / f"boot/config-{os.uname().release}").write_text(CONFIG + config)
+    (machine / "proc/cmdline").write_text(f"{cmdline}\n")
+    (machine / "sys/fs/cgroup").mkdir(parents=True)
+    (machine / "sys/fs/cgroup/cgroup.controllers").write_text(f"{controllers}\n")
+    assert read_real_time(machine).has_groups is has_groups
+
+
+@pytest.mark.parametrize("uid", [0, 1000])
+@pytest.mark.parametrize(("bounding", "can_raise"), [("fcecbfff", False), ("ffffffff", None)])
+def test_what_no_service_gets(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, uid: int, bounding: str, can_raise: bool | None
+) -> None:
+    """A user is told the same as root, who has tried it as well."""
+    monkeypatch.setattr("os.geteuid", lambda: uid)
+    (machine / "proc/1").mkdir()
+    (machine / "proc/1/status").write_text(f"Name:\tsystemd\nCapBnd:\t00000000{bounding}\n")
+    tried = False if uid == 0 else None
+    assert read_real_time(machine).can_raise is (tried if can_raise is None else can_raise)
+
+
 def test_its_cpus(machine: Path) -> None:
     for number, governor in enumerate(("powersave", "performance", "powersave")):
         place = machine / CPUS / f"cpu{number}/cpufreq"

@@ -10,7 +10,7 @@ from dora_systemd.decisions.views.real_time import RealTime, judge_cpuset, judge
     ("facts", "state", "words"),
     [
         (RealTime(), State.OK, "if root gives it"),
-        (RealTime(has_groups=True, is_granted=True), State.OK, "if root gives it"),
+        (RealTime(has_groups=True, is_granted=True), State.NOTE, "CONFIG_RT_GROUP_SCHED"),
         (RealTime(is_granted=True, can_raise=True), State.OK, "if root gives it"),
         (RealTime(has_groups=True), State.NOTE, "CONFIG_RT_GROUP_SCHED"),
         (RealTime(has_groups=True, is_granted=False), State.NOTE, "CONFIG_RT_GROUP_SCHED"),
