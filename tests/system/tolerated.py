@@ -55,6 +55,8 @@ TOLERATED = (
     Word("failed to report outputs done to dora-daemon", _ENDING),
     Word("failed to close outputs on drop", _ENDING),
     Word("failed to send metrics for dataflow: WS send channel closed", _ENDING),
+    # The coordinator, when a machine that has no node left ends its part before the stop is sent.
+    Word("failed to send/receive stop message: WS daemon send channel closed", _ENDING),
     Word("dropping event because event `tx` was already closed", _ENDING),
     Word(
         "failed to notify daemon of peer disconnect: WS daemon send channel closed",
