@@ -4,11 +4,8 @@ The order of NODE_FACTS is that of JSON and of the metrics.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from dora_systemd.decisions.cell.asked import is_stopped, is_stopping
-from dora_systemd.decisions.cell.machines import HEAD
-from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, NodeStatus
 from dora_systemd.decisions.views.formats import (
     UNKNOWN,
     format_count,
@@ -17,6 +14,9 @@ from dora_systemd.decisions.views.formats import (
     format_watchdog,
 )
 from dora_systemd.values import SECOND
+
+if TYPE_CHECKING:
+    from dora_systemd.decisions.cell.status import NodeStatus
 
 SILENT = "Silent"
 """A node that runs, and sends no output that it owes."""
@@ -96,7 +96,7 @@ class Fact(NamedTuple):
     key: str
     field: str = ""
     value: Callable[[Any], Any] = lambda value: None if value == "" else value
-    told: Callable[[NodeStatus], Any] | None = None
+    told: Callable[["NodeStatus"], Any] | None = None
     is_moment: bool = False
     column: str = ""
     cell: Callable[[NodeRow], str] | None = None
@@ -140,7 +140,28 @@ def _seconds(time: int | None, **labels: str) -> list[Sample]:
     return [] if time is None else [(labels, time / SECOND)]
 
 
+def _state(one: "NodeStatus") -> str:
+    # Imported late, as below: a list without dataflows has no node.
+    from dora_systemd.decisions.cell.asked import is_stopping
+
+    return "stopping" if is_stopping(one) else one.state
+
+
+def _stopped_by(one: "NodeStatus") -> str:
+    from dora_systemd.decisions.cell.asked import is_stopped
+
+    return one.asked_by if is_stopped(one) else ""
+
+
+def _machine(row: NodeRow) -> str:
+    from dora_systemd.decisions.cell.machines import HEAD
+
+    return row.machine or HEAD
+
+
 def _ready(row: NodeRow) -> list[Sample]:
+    from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES
+
     is_there = row.state in ALIVE_NODE_STATES and row.since > 0
     return _seconds(row.since if is_there else None)
 
@@ -168,14 +189,14 @@ USAGE = (
 NODE_FACTS = (
     Fact("node", column="NODE"),
     Fact("machine", told=lambda one: one.machine, column="MACHINE",
-        cell=lambda row: row.machine or HEAD, has=lambda row: row.machine),
-    Fact("state", told=lambda one: "stopping" if is_stopping(one) else one.state,
+        cell=_machine, has=lambda row: row.machine),
+    Fact("state", told=_state,
         column="STATE", cell=lambda row: row.word),
     Fact("pid", value=lambda pid: pid or None, told=lambda one: 0 if one.is_held else one.pid,
         column="PID"),
     Fact("exit", told=lambda one: str(one.exit), column="EXIT", rank=1),
     Fact("waits_for", "needs", told=lambda one: one.needs),
-    Fact("stopped_by", told=lambda one: one.asked_by if is_stopped(one) else ""),
+    Fact("stopped_by", told=_stopped_by),
     Fact("since", told=lambda one: one.since_us, is_moment=True,
         metric="ready_time_seconds", help="When it became ready, in Unix time.", samples=_ready),
     Fact("text", column="STATUS TEXT", cell=lambda row: row.text, has=lambda row: row.text, rank=2),
@@ -198,7 +219,7 @@ NODE_FACTS = (
 _TOLD = [(one.field or one.key, one.told) for one in NODE_FACTS if one.told]
 
 
-def node_row(node: str, status: NodeStatus | None, known: Mapping[str, Any]) -> NodeRow:
+def node_row(node: str, status: "NodeStatus | None", known: Mapping[str, Any]) -> NodeRow:
     """The row of a node. status: in the runner's table, if it is there. known: other fields."""
     told = {name: read(status) for name, read in _TOLD} if status else {"state": UNKNOWN_STATE}
     return NodeRow(node, **told, **known)

@@ -120,6 +120,11 @@ LATE = {
         "decisions.reload.watch_rules": {"pathspec"},
         "verbs.start.watch": {"adapters.host.watch"},
     },
+    "a list without dataflows has no node": {
+        "decisions.views.facts": {
+            *("decisions.cell.asked", "decisions.cell.machines", "decisions.cell.status"),
+        },
+    },
     "most dataflows have no notify sockets": {
         "runner.signs.hook": {"runner.signs.sockets"},
         "runner.cell.dialogue": {"runner.signs.watch"},
