@@ -50,20 +50,22 @@ class DoraSystemdError(Exception):
 
 
 class WrongKey(DoraSystemdError):
-    """A settings file has a wrong key or value. source: its path. place: the keys down to there."""
+    """A settings file has a wrong key or value. source: its path. place: the keys down to there.
 
-    def __init__(self, message: str, hint: str, source: str, place: Sequence[str]) -> None:
-        super().__init__(message, hint, ExitCode.BAD_INPUT)
+    end: of the message, behind the number of the line.
+    """
+
+    def __init__(
+        self, message: str, hint: str, source: str, place: Sequence[str], end: str = ""
+    ) -> None:
+        super().__init__(f"{message}{end}", hint, ExitCode.BAD_INPUT)
         self.source, self.place = source, tuple(place)
+        self._begin, self._end = message, end
 
     def at_line(self, line: int) -> DoraSystemdError:
         """The error with the number of the line, which is 0 if it is not known."""
-        if not line:
-            return self
-        # A place in parentheses has it inside: (memory_limit in robot.systemd.yml at line 2).
-        end = ")" * self.message.endswith(")")
-        message = f"{self.message.removesuffix(end)} at line {line}{end}"
-        return DoraSystemdError(message, self.hint, self.code)
+        where = f" at line {line}" if line else ""
+        return DoraSystemdError(f"{self._begin}{where}{self._end}", self.hint, self.code)
 
 
 class TimedOut(DoraSystemdError):

@@ -49,6 +49,7 @@ def main(argv: list[str]) -> int:
         return 0
     if was_stopped_early(os.environ):
         write_last_words(argv[0], argv[1], Path(directory), "dataflow-stopped", {})
+        return 0
     if not reason:
         return 0
     unit = unit_group()
@@ -68,8 +69,7 @@ def was_stopped_early(environ: Mapping[str, str]) -> bool:
 def killed_by(environ: Mapping[str, str]) -> tuple[Cause, str]:
     """How the runner was killed, see EXIT_CODE in systemd.exec(5); "" if it exited by itself."""
     result = environ.get("SERVICE_RESULT", "")
-    is_killed = environ.get("EXIT_CODE", "") in ("killed", "dumped")
-    if not is_killed or was_stopped_early(environ):
+    if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
         return Cause.RUNNER_KILLED, ""
     killed = f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
     return UNIT_RESULTS.get(result, (Cause.RUNNER_KILLED, killed))

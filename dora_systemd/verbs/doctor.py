@@ -191,15 +191,19 @@ def _is_down(manager: Manager, unit: str) -> bool:
 
 
 def _journal(reach: Callable[[Scope], Manager], scope: Scope) -> Iterator[Finding]:
-    config = _journald_config()
+    try:
+        config = run_command(_JOURNALD_CONFIG, _SECONDS).stdout
+        rate = judge_rate(config, scope.is_user)
+    except DoraSystemdError as error:
+        config, rate = "", Finding("log rate", State.NOTE, error.message)
     place = _journal_place(reach)
     try:
         journal_reader.check_readable(scope)
     except DoraSystemdError as error:
         if place is Place.UNKNOWN or error.code is not ExitCode.NO_SYSTEMD:  # else it says the same
             yield Finding("journal", State.WARNING, error.message, error.hint)
-    yield judge_journal(place, storage_of("" if isinstance(config, Finding) else config))
-    yield config if isinstance(config, Finding) else judge_rate(config, scope.is_user)
+    yield judge_journal(place, storage_of(config))
+    yield rate
 
 
 def _journal_place(reach: Callable[[Scope], Manager]) -> Place:
@@ -211,14 +215,6 @@ def _journal_place(reach: Callable[[Scope], Manager]) -> Place:
     if facts["ActiveState"] in DOWN:
         return Place.STOPPED
     return journal_reader.place_since(int(facts[_STARTED]))
-
-
-def _journald_config() -> str | Finding:
-    """The text of journald.conf and its drop-ins, or the finding that it is not known."""
-    try:
-        return run_command(_JOURNALD_CONFIG, _SECONDS).stdout
-    except DoraSystemdError as error:
-        return Finding("log rate", State.NOTE, error.message)
 
 
 def _dora(_scope: Scope, _root: Path) -> Iterator[Finding]:

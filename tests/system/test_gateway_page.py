@@ -275,5 +275,5 @@ KEPT = """
 
 
 def test_the_same_graph_keeps_its_boxes(browser: Browser) -> None:
-    """Between the two halves of a click a node is not drawn anew."""
+    """A mouse button goes down and up over the same box."""
     assert browser.js(KEPT) == [True, True, 2]

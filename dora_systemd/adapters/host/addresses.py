@@ -5,6 +5,9 @@ import errno
 import socket
 import time
 
+_HOST = "127.0.0.1"
+_RETRY_SECONDS = 0.05
+_CHUNK = 65536
 _ANY_PORT = 9
 """Nothing is sent there: it is only for the choice of a route."""
 
@@ -42,11 +45,6 @@ def is_own(address: str) -> bool:
 
 def _socket(address: str, kind: socket.SocketKind) -> socket.socket:
     return socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, kind)
-
-
-_HOST = "127.0.0.1"
-_RETRY_SECONDS = 0.05
-_CHUNK = 65536
 
 
 def port_error(port: int) -> int:

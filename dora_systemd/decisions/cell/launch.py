@@ -27,10 +27,13 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, quoted, shown
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
-PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
+_BUILT = ("build", "git", "branch", "tag", "rev")
+PROGRAM_KEYS = ("path", "args", *_BUILT)
 """Keys of a node that define its program; dora gets other values."""
 PERL = "/usr/bin/perl"
 """The interpreter of launcher.pl."""
+_LAUNCH = '$f = "$ENV{DORA_SYSTEMD_CELL}/launch/%s"; do $f; die "cannot run $f: $@$!\\n"'
+"""The program of a node on another machine. Perl and no shell, as for launcher.pl."""
 _UV_RUN = ("uv", "run")
 _BUDGET = ("max_restarts", "restart_window")
 DEFAULT_OPERATOR = "op"
@@ -313,10 +316,6 @@ def _refusal(source: str, node: Node, reason: str, hint: str) -> DoraSystemdErro
     return DoraSystemdError(
         f"cannot start {source}: node {node.id}: {reason}", hint, ExitCode.BAD_INPUT
     )
-
-
-_BUILT = ("build", "git", "branch", "tag", "rev")
-_LAUNCH = '$f = "$ENV{DORA_SYSTEMD_CELL}/launch/%s"; do $f; die "cannot run $f: $@$!\\n"'
 
 
 def _placed_node(node: str, raw: Mapping[str, Any], machine: str) -> dict[str, Any]:

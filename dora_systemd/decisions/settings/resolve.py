@@ -132,7 +132,7 @@ def _from_flag(
 ) -> Iterator[Given]:
     value = flags.get(setting.name)
     if is_given(value):
-        yield setting.flags[0], _parsed(setting, value, setting.flags[0], ExitCode.USAGE, base)
+        yield setting.flags[0], _parsed(setting, value, setting.flags[0], base)
 
 
 def _from_variable(
@@ -141,7 +141,7 @@ def _from_variable(
     # For shells, an empty variable usually means unset.
     value = environment.get(setting.variable, "") if setting.variable else ""
     if value:
-        yield setting.variable, _parsed(setting, value, setting.variable, ExitCode.USAGE, base)
+        yield setting.variable, _parsed(setting, value, setting.variable, base)
 
 
 def _from_files(
@@ -154,22 +154,19 @@ def _from_files(
 
 def _parsed_in_file(setting: Setting[Any], value: object, source: str, *place: str) -> Any:
     base = PurePath(source).parent
-    where = f"{'.'.join(place)} in {shown(source)}"
     try:
-        return _parsed(
-            setting, value, where, ExitCode.BAD_INPUT, base if base.is_absolute() else None
-        )
+        return setting.kind.parse(value, base if base.is_absolute() else None)
     except DoraSystemdError as error:
-        raise WrongKey(error.message, error.hint, source, place) from error
+        message = f"{error.message} ({'.'.join(place)} in {shown(source)}"
+        raise WrongKey(message, error.hint, source, place, end=")") from error
 
 
-def _parsed(
-    setting: Setting[Any], value: object, where: str, code: ExitCode, base: Base = None
-) -> Any:
+def _parsed(setting: Setting[Any], value: object, where: str, base: Base) -> Any:
     try:
         return setting.kind.parse(value, base)
     except DoraSystemdError as error:
-        raise DoraSystemdError(f"{error.message} ({where})", error.hint, code) from error
+        message = f"{error.message} ({where})"
+        raise DoraSystemdError(message, error.hint, ExitCode.USAGE) from error
 
 
 def _merged(setting: Setting[Any], given: Sequence[Given]) -> Given:

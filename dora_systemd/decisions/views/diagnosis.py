@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from dora_systemd.decisions.unit.versions import MIN_VERSION, lacking
 from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.decisions.views.journal import assigned
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import format_duration, parse_duration
 
@@ -85,7 +86,7 @@ def judge_controllers(available: Collection[str], is_user: bool) -> Finding:
 def judge_rate(config: str, is_user: bool) -> Finding:
     """The rate limit of journald, see journald.conf(5). config: that file and its drop-ins."""
     values = dict(_RATE_DEFAULTS)
-    for key, value in re.findall(r"^[ \t]*(RateLimit\w+)[ \t]*=[ \t]*(\S*)", config, flags=re.M):
+    for key, value in assigned(config, r"RateLimit\w+"):
         values[key] = value or _RATE_DEFAULTS.get(key, "")
     interval, burst = values["RateLimitIntervalSec"], values["RateLimitBurst"]
     if interval in ("0", "0s") or burst == "0":

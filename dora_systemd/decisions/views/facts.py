@@ -47,8 +47,8 @@ class NodeRow(NamedTuple):
     must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
     the dataflow. scheduling: as in the settings, or "". cpus: those that it may use, "" if the
     settings name none. silent: what is missing of the outputs that it owes, or "". needs: what it
-    waits for, or "". machine: the other machine that it runs on, or "". stopped_by: who has asked
-    for a stop of the node alone, or "".
+    waits for, or "". machine: the machine of the node, "" for this one. stopped_by: who requested
+    the stop of this node alone, or "".
     """
 
     node: str

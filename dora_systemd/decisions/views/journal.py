@@ -8,7 +8,6 @@ from dora_systemd.decisions.views.findings import Finding, State
 TOPIC = "journal"
 _NEVER, _MEMORY, _DEFAULT = "none", "volatile", "auto"
 _WORDS = (_NEVER, _MEMORY, _DEFAULT, "persistent")
-_STORAGE = re.compile(r"^[ \t]*Storage[ \t]*=[ \t]*(\S*)", flags=re.M)
 _KEEP = (
     "as root: set Storage=persistent in journald.conf(5), then systemctl restart systemd-journald"
 )
@@ -25,10 +24,16 @@ class Place(StrEnum):
     UNKNOWN = "unknown"
 
 
+def assigned(config: str, keys: str) -> list[tuple[str, str]]:
+    """The keys and values of journald.conf and its drop-ins, in their order. keys: a pattern."""
+    return re.findall(rf"^[ \t]*({keys})[ \t]*=[ \t]*(\S*)", config, flags=re.M)
+
+
 def storage_of(config: str) -> str:
     """The Storage= of journald. config: journald.conf and its drop-ins, in their order."""
     # journald ignores a word that it does not know.
-    return next((word for word in reversed(_STORAGE.findall(config)) if word in _WORDS), _DEFAULT)
+    words = [word for _, word in assigned(config, "Storage") if word in _WORDS]
+    return words[-1] if words else _DEFAULT
 
 
 def judge_journal(place: Place, storage: str) -> Finding:

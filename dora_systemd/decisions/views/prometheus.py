@@ -80,6 +80,7 @@ RESTARTS = Family("restarts_total", "Automatic restarts; those that somebody ask
 READY = Family("ready_time_seconds", "When all nodes were ready, in Unix time.")
 INFO = Family("info", "UUID, unit and release of a dataflow; the value is always 1.")
 RIGHTS = Family("info", "What it is, its scheduling and CPUs; the value is always 1.")
+FACT_FAMILIES = [(one, Family(one.metric, one.help)) for one in NODE_FACTS if one.metric]
 NODES = Family("nodes", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "Nodes that are running.")
 LINES = Family("log_lines_total", "Lines sent to journald.")
@@ -125,15 +126,15 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
         for one in observed
         for node in one.row.nodes
     ]
-    yield RIGHTS, [({**own, **node_labels(n)}, 1) for own, _, n in places if node_labels(n)]
+    yield RIGHTS, [({**own, **more}, 1) for own, _, n in places if (more := node_labels(n))]
     states = (*NODE_STATES, UNKNOWN_STATE)
     yield STATE, [sample for own, _, node in places for sample in _states(own, node.state, states)]
     restarts = [(own, node.restarts) for own, _, node in places]
     yield RESTARTS, [(own, count) for own, count in restarts if count is not None]
-    for fact in (one for one in NODE_FACTS if one.metric):
+    for fact, family in FACT_FAMILIES:
         found = [(own, node_samples(fact, node)) for own, _, node in places]
         samples: list[Sample] = [({**own, **more}, v) for own, some in found for more, v in some]
-        yield Family(fact.metric, fact.help), samples
+        yield family, samples
     counts = [(own, o.lines[node.node]) for own, o, node in places if node.node in o.lines]
     yield LINES, [(own, count.written) for own, count in counts]
     yield SUPPRESSED, [(own, count.suppressed) for own, count in counts]

@@ -28,6 +28,7 @@ _EXPLAIN_SECONDS = 0.5
 _ASK_SECONDS = 2.0
 _ANSWER_SECONDS = 1.0
 """Time for the head to hear that this part ends; it is part of the time of a stop."""
+_FIND_SECONDS = 10.0
 _UNKNOWN = ("", "offline", "unknown")
 _GOING_DOWN = "the machine is shutting down"
 _ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
@@ -176,9 +177,6 @@ def is_going_down(is_of_user: bool) -> bool:
         done = run_command(["systemctl", *scope, "is-system-running"], _ASK_SECONDS)
         return done.stdout.strip() in ("stopping", *_UNKNOWN)
     return True
-
-
-_FIND_SECONDS = 10.0
 
 
 async def find_pids(pump: Pump, nodes: Nodes) -> None:

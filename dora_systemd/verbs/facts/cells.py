@@ -17,6 +17,8 @@ from dora_systemd.names import (
 if TYPE_CHECKING:
     from dora_systemd.decisions.cell.options import RunnerOptions
 
+CONTROL = "control"
+"""What is done to single nodes, or by the dora command: no verb has this name."""
 _PATTERN = f"{UNIT_PREFIX}*{UNIT_SUFFIX}"
 
 
@@ -162,10 +164,6 @@ def _read_options(manager: Manager, unit: str) -> "RunnerOptions | None":
     except (DoraSystemdError, IndexError):
         return None
     return options if name_from_unit(unit) == options.name else None
-
-
-CONTROL = "control"
-"""What is done to single nodes, or by the dora command: no verb has this name."""
 
 
 def refuse_parts(cells: Iterable[Cell], verb: str) -> None:

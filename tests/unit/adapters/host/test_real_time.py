@@ -72,7 +72,7 @@ def test_where_groups_matter(
 def test_what_no_service_gets(
     machine: Path, monkeypatch: pytest.MonkeyPatch, uid: int, bounding: str, can_raise: bool | None
 ) -> None:
-    """A user is told the same as root, who has tried it as well."""
+    """PID 1 decides for a user and for root; only root can also try."""
     monkeypatch.setattr("os.geteuid", lambda: uid)
     (machine / "proc/1").mkdir()
     (machine / "proc/1/status").write_text(f"Name:\tsystemd\nCapBnd:\t00000000{bounding}\n")
