@@ -1,8 +1,8 @@
 """Speed, latency and memory of the way from the pipes to the journal, without dora."""
 
 import json
-import os
 import sys
+from bisect import bisect
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import pytest
 from tests.system.cells import run
 
 ROOT = Path(__file__).parents[2]
-SLACK = int(os.environ.get("DORA_LOG_SLACK", "1"))
 
 
 # LogRateLimitIntervalSec= works in system scope only.
@@ -30,10 +29,12 @@ def pump(*arguments: str) -> dict[str, Any]:
     return result
 
 
-def records(uuid: str, node: str) -> list[dict[str, Any]]:
+def records(uuid: str, node: str) -> list[tuple[int, str]]:
+    """A node's lines, each with the time at which journald took it, in microseconds."""
     matches = (f"DORA_DATAFLOW={uuid}", f"DORA_NODE={node}", "DORA_STREAM=stdout")
     done = run("journalctl", "-q", "-o", "json", "--output-fields=MESSAGE", *matches)
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    found = map(json.loads, done.stdout.splitlines())
+    return [(int(one["__REALTIME_TIMESTAMP"]), one["MESSAGE"]) for one in found]
 
 
 def test_memory_stays_flat() -> None:
@@ -43,10 +44,12 @@ def test_memory_stays_flat() -> None:
 
 def test_quiet_node_is_not_kept_waiting() -> None:
     found = pump("--lines", "150000", "--quiet", "200")
-    delays = sorted(
-        int(record["__REALTIME_TIMESTAMP"]) - int(record["MESSAGE"].split()[1])
-        for record in records(found["uuid"], "quiet")
-    )
-    assert len(delays) == 200
-    # The median: on a busy machine with two processors the tail is the scheduler's.
-    assert delays[100] < 5000 * SLACK
+    flood = [arrived for arrived, _ in records(found["uuid"], "n0")]
+    quiet = records(found["uuid"], "quiet")
+    # Lines of the flood that journald took while a line of the quiet node was on its way: time
+    # would depend on how busy the machine is.
+    before = [
+        bisect(flood, arrived) - bisect(flood, int(text.split()[1])) for arrived, text in quiet
+    ]
+    assert len(before) == 200
+    assert sorted(before)[100] < 200
