@@ -75,8 +75,8 @@ def _find_refusal(scope: Scope, cell: Cell, ask: Ask) -> DoraSystemdError | None
     if error is None:
         return None
     goes_on = f"{cell.name} keeps running; doractl restart --force {cell.name} restarts it anyway"
-    hint = ", ".join(filter(None, (error.hint, goes_on)))
-    return DoraSystemdError(error.message, hint, error.code)
+    hint = f"{error.hint}, ".replace("?,", "?") if error.hint else ""
+    return DoraSystemdError(error.message, f"{hint}{goes_on}", error.code)
 
 
 def _outcome(manager: Manager, scope: Scope, cell: Cell, result: str, was_frozen: bool) -> Outcome:
