@@ -112,7 +112,7 @@ def check_document(
     or a value has the wrong type.
     """
     # Imported late: only settings files need pydantic.
-    from dora_systemd.decisions.settings.schema import settings_model, validation_error
+    from dora_systemd.decisions.settings.schema import validate_settings, validation_error
 
     if document is None:
         return {}
@@ -121,7 +121,7 @@ def check_document(
         raise refusal(source, "it is not a mapping", hint)
     check_json(document, source, MAX_JSON)
     try:
-        settings_model(table).model_validate(document)
+        validate_settings(document, table)
     except ValueError as error:
         raise validation_error(source, error, table) from error
     return {key: value for key, value in document.items() if value is not None}

@@ -1,9 +1,21 @@
 """The schema of settings files, from the table of settings. Only this module imports pydantic."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import or_
+from types import UnionType
+from typing import Any, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+from pydantic import (
+    VERSION,
+    BaseModel,
+    StrictBool,
+    StrictFloat,
+    StrictInt,
+    StrictStr,
+    ValidationError,
+    create_model,
+)
 
 from dora_systemd.decisions.descriptor.json_size import refusal
 from dora_systemd.decisions.settings.kinds import Setting
@@ -15,7 +27,21 @@ NODES = "nodes"
 """The key of per-node settings in a settings file: `nodes: NODE: KEY: VALUE`."""
 
 # strict: pydantic must not convert between lists, texts and booleans; the kinds parse texts.
-_CONFIG = ConfigDict(extra="forbid", strict=True)
+# Debian 12 and Ubuntu 24.04 have pydantic 1.10, which has strict types but no strict models.
+_IS_OLD = VERSION.startswith("1.")
+_WORDS: dict[str, Any] = {"extra": "forbid", "strict": True}
+_CONFIG: Any = type("Config", (), _WORDS) if _IS_OLD else _WORDS
+_STRICT = {str: StrictStr, int: StrictInt, float: StrictFloat, bool: StrictBool}
+_UNKNOWN = ("extra_forbidden", "value_error.extra")
+
+
+def validate_settings(document: object, table: Sequence[Setting[Any]]) -> None:
+    """Raise ValueError, for validation_error(), if `document` is not a settings file of `table`."""
+    model = settings_model(table)
+    if _IS_OLD:
+        model.parse_obj(_no_mapping(document))
+    else:
+        model.model_validate(document)
 
 
 def settings_model(table: Sequence[Setting[Any]]) -> type[BaseModel]:
@@ -35,10 +61,10 @@ def validation_error(
     """The first error that pydantic found in the file `source`, in one line."""
     if not isinstance(error, ValidationError):
         return refusal(source, "it is not a settings file", str(error))
-    first = error.errors(include_url=False, include_input=False)[0]
+    first = error.errors()[0]
     place = [str(part) for part in first["loc"]]
     settings = {setting.name: setting for setting in table}
-    if first["type"] == "extra_forbidden":
+    if first["type"] in _UNKNOWN:
         near = did_you_mean(place[-1], _known(place, table))
         hint = near or "dora-systemd.yml(5) lists the keys"
         owner = f" of node {quoted(place[1])}" if len(place) > 2 and place[0] == "nodes" else ""
@@ -52,7 +78,32 @@ def validation_error(
 
 
 def _fields(table: Sequence[Setting[Any]]) -> dict[str, Any]:
-    return {setting.name: (setting.kind.schema | None, None) for setting in table}
+    return {setting.name: (_strict(setting.kind.schema) | None, None) for setting in table}
+
+
+class _List(list[Any]):
+    keys = None
+
+
+class _Text(str):
+    keys = None
+
+
+def _no_mapping(value: Any) -> Any:
+    """The value with lists and texts that pydantic 1.10 cannot pass to dict(), as it tries to."""
+    if isinstance(value, Mapping):
+        return {key: _no_mapping(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return _List(map(_no_mapping, value))
+    return _Text(value) if isinstance(value, str) else value
+
+
+def _strict(schema: Any) -> Any:
+    """The type `schema` without conversions, for either version of pydantic."""
+    inner = [_strict(one) for one in get_args(schema)]
+    if not inner:
+        return _STRICT.get(schema, schema)
+    return reduce(or_, inner) if isinstance(schema, UnionType) else get_origin(schema)[*inner]
 
 
 def _known(place: Sequence[str], table: Sequence[Setting[Any]]) -> list[str]:

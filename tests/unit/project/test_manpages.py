@@ -14,7 +14,7 @@ from dora_systemd.decisions.gateway.place import ADDRESS_VARIABLE, PORT_VARIABLE
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.settings.kinds import Setting
-from dora_systemd.decisions.settings.schema import settings_model
+from dora_systemd.decisions.settings.schema import validate_settings
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.start.settings import SYSTEM_FILE
@@ -135,7 +135,7 @@ def test_settings_files_of_the_examples(tmp_path: Path) -> None:
     for block in blocks:
         path = tmp_path / "config.yml"
         path.write_text(block)
-        settings_model(SETTINGS).model_validate(files.read_yaml(path))
+        validate_settings(files.read_yaml(path), SETTINGS)
 
 
 def entries() -> dict[str, str]:

@@ -295,6 +295,8 @@ def test_a_new_setting_is_one_declaration() -> None:
         ({"nodes": {"camera": {"mod": 1}}}, "unknown key 'mod' of node 'camera'"),
         ({"nodes": {"camera": 5}}, "the value of nodes is of another type"),
         ({"nodes": []}, "the value of nodes is of another type"),
+        ({"nodes": {"camera": []}}, "the value of nodes is of another type"),
+        ({"nodes": {"camera": ""}}, "the value of nodes is of another type"),
     ],
 )
 def test_bad_settings_of_nodes(document: object, message: str) -> None:
