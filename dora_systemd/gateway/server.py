@@ -1,7 +1,7 @@
 """The gateway's server: HTTP and WebSockets on the sockets that systemd has opened.
 
-access.py decides about every connection before a route gets it. The library supports only GET
-requests and one request for each connection, which is sufficient here.
+access.py decides about every connection before a route gets it. There is one request for each
+connection.
 """
 
 import asyncio
@@ -11,14 +11,12 @@ import socket
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from http import HTTPStatus
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
-from websockets.asyncio.server import Server, ServerConnection, serve
-from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import WebSocketException
 from websockets.http11 import Request as RawRequest
-from websockets.http11 import Response
 
 from dora_systemd.decisions.gateway.access import (
     STRANGER_SECONDS,
@@ -29,15 +27,13 @@ from dora_systemd.decisions.gateway.access import (
 )
 from dora_systemd.decisions.gateway.request import Answer, Request, text_answer
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.gateway.connection import Gone, ServerSocket
 from dora_systemd.gateway.live.acting import ACTIONS
 from dora_systemd.gateway.routes import GET, OPEN_TO_ALL, SOCKETS
 from dora_systemd.scope import Scope
 from dora_systemd.trust.socket_table import peer_uid
 
 log = logging.getLogger(__name__)
-
-MAX_FRAME = 1024 * 1024
-"""Maximum bytes of a frame; the limit of dora's own coordinator."""
 
 OPEN_SECONDS = 20.0
 """Timeout for a request to arrive completely and be answered."""
@@ -52,9 +48,9 @@ itself allows a few more than the machine has processors: one page could hold up
 
 _ALWAYS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
-_quiet = logging.getLogger("dora_systemd.websockets")
 # Malformed requests are not our errors, and the library logs a traceback for each of them.
-_quiet.setLevel(logging.CRITICAL + 1)
+for _name in ("websockets.client", "websockets.server"):
+    logging.getLogger(_name).setLevel(logging.CRITICAL + 1)
 
 
 class Gateway:
@@ -66,6 +62,7 @@ class Gateway:
         self._count = 0
         self._door = Door(os.getuid())
         self._since = time.monotonic()
+        self._tasks: set[asyncio.Task[None]] = set()
 
     async def run(self, sockets: Sequence[socket.socket], idle_seconds: float) -> None:
         """Serve until there was no connection for `idle_seconds`; cancel it to end at once."""
@@ -82,7 +79,7 @@ class Gateway:
         finally:
             # systemd keeps the sockets: later connections start the next gateway.
             for server in servers:
-                server.close(close_connections=False)
+                server.close()
         await asyncio.sleep(0)
         await asyncio.sleep(0)
         return self._count == 0
@@ -92,72 +89,70 @@ class Gateway:
             return idle_seconds
         return self._since + idle_seconds - time.monotonic()
 
-    async def _listen(self, listener: socket.socket) -> Server:
-        return await serve(
-            self._talk,
-            sock=listener.dup(),
-            process_request=self._answer,
-            create_connection=self._connection_class(),
-            backlog=_BACKLOG,
-            server_header="dora-systemd",
-            logger=_quiet,
-            compression=None,
-            max_size=MAX_FRAME,
-            open_timeout=OPEN_SECONDS,
-            # A dora command that waits for a reply does not read, so it answers no ping.
-            ping_interval=None,
-        )
+    async def _listen(self, listener: socket.socket) -> asyncio.Server:
+        return await asyncio.start_server(self._enter, sock=listener.dup(), backlog=_BACKLOG)
 
-    def _connection_class(self) -> type[ServerConnection]:
-        gateway = self
+    def _enter(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Take a connection: asyncio calls this before anything is read from it."""
+        socket = ServerSocket(reader, writer)
+        uid = _uid_behind(*socket.ends)
+        if not self._door.enter(uid):
+            socket.abort()
+            return
+        self._count += 1
+        task = asyncio.get_running_loop().create_task(self._serve(socket, uid))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
-        class Counted(ServerConnection):
-            def connection_made(self, transport: asyncio.BaseTransport) -> None:
-                gateway._count += 1
-                ends = map(transport.get_extra_info, ("peername", "sockname"))
-                self._uid = _uid_behind(*ends)
-                self._is_in = gateway._door.enter(self._uid)
-                super().connection_made(transport)
-                if not self._is_in:
-                    self.transport.abort()
-                elif gateway._door.is_stranger(self._uid):
-                    self.loop.call_later(STRANGER_SECONDS, self._end_if_silent)
-
-            def connection_lost(self, exc: Exception | None) -> None:
-                if self._is_in:
-                    gateway._door.leave(self._uid)
-                gateway._count -= 1
-                gateway._since = time.monotonic()
-                super().connection_lost(exc)
-
-            def _end_if_silent(self) -> None:
-                if self.request is None:
-                    self.transport.abort()
-
-        return Counted
-
-    async def _answer(self, connection: ServerConnection, raw: RawRequest) -> Response | None:
-        """The response to an HTTP request; None lets a WebSocket connection begin."""
+    async def _serve(self, socket: ServerSocket, uid: int | None) -> None:
+        if self._door.is_stranger(uid):
+            asyncio.get_running_loop().call_later(STRANGER_SECONDS, socket.end_if_silent)
         try:
-            answer = self._refusal(connection, raw) or await self._routed(raw)
+            with suppress(OSError, TimeoutError, WebSocketException):
+                async with asyncio.timeout(OPEN_SECONDS):
+                    request = await self._open(socket)
+                if request is not None:
+                    await self._talk(socket, request)
+                await socket.end()
+        except Exception as error:
+            log.error("cannot serve a connection: %s: %s", type(error).__name__, error)
+        finally:
+            socket.abort()
+            self._door.leave(uid)
+            self._count -= 1
+            self._since = time.monotonic()
+
+    async def _open(self, socket: ServerSocket) -> RawRequest | None:
+        """Answer the request; the request itself if a WebSocket connection has begun."""
+        raw = await socket.request()
+        if raw is None:
+            return None
+        answer = await self._answer(socket, raw)
+        if answer is None:
+            return raw if await socket.begin(raw) else None
+        await socket.answer(replace(answer, headers={**_ALWAYS, **answer.headers}))
+        return None
+
+    async def _answer(self, socket: ServerSocket, raw: RawRequest) -> Answer | None:
+        """The answer to an HTTP request; None lets a WebSocket connection begin."""
+        try:
+            return self._refusal(socket, raw) or await self._routed(raw)
         except TimeoutError:
-            answer = text_answer(504, "no answer in time")
+            return text_answer(504, "no answer in time")
         except DoraSystemdError as error:
-            answer = text_answer(503, f"{error.message}\n{error.hint}".strip())
+            return text_answer(503, f"{error.message}\n{error.hint}".strip())
         except Exception as error:
             log.error("cannot answer %.200s: %s: %s", raw.path, type(error).__name__, error)
-            answer = text_answer(500, "internal error in the gateway, see its journal")
-        return None if answer is None else _response(answer)
+            return text_answer(500, "internal error in the gateway, see its journal")
 
-    def _refusal(self, connection: ServerConnection, raw: RawRequest) -> Answer | None:
+    def _refusal(self, socket: ServerSocket, raw: RawRequest) -> Answer | None:
         values = raw.headers.get_all
         refusal = refuse_address(values("Host"), values("Origin"))
         is_open = _path(raw) in OPEN_TO_ALL
         if refusal or is_open or has_token(values("Authorization"), self._token):
             return refusal
         # Look up the user again; an address is None once the client has disconnected.
-        uid = _uid_behind(connection.remote_address, connection.local_address)
-        return refuse_user(uid, os.getuid())
+        return refuse_user(_uid_behind(*socket.ends), os.getuid())
 
     async def _routed(self, raw: RawRequest) -> Answer | None:
         # get() raises for a header that occurs twice.
@@ -172,21 +167,20 @@ class Gateway:
         async with asyncio.timeout(_ANSWER_SECONDS):
             return await GET[path](Request(path, self._scope))
 
-    async def _talk(self, connection: ServerConnection) -> None:
+    async def _talk(self, socket: ServerSocket, raw: RawRequest) -> None:
         """Serve one WebSocket connection."""
-        raw = connection.request
-        assert raw is not None
         path = _path(raw)
         try:
-            await SOCKETS[path](connection, Request(path, self._scope))
-        except ConnectionClosed:
+            await SOCKETS[path](socket, Request(path, self._scope))
+            await socket.close()
+        except Gone:
             return
         except DoraSystemdError as error:
             reason = error.message.encode()[:_REASON_BYTES].decode(errors="ignore")
-            await connection.close(1011, reason)
+            await socket.close(1011, reason)
         except Exception as error:
             log.error("cannot continue with %.200s: %s: %s", raw.path, type(error).__name__, error)
-            await connection.close(1011, "internal error in the gateway, see its journal")
+            await socket.close(1011, "internal error in the gateway, see its journal")
 
 
 def _uid_behind(peer: Any, own: Any) -> int | None:
@@ -196,15 +190,3 @@ def _uid_behind(peer: Any, own: Any) -> int | None:
 
 def _path(raw: RawRequest) -> str:
     return raw.path.partition("?")[0]
-
-
-def _response(answer: Answer) -> Response:
-    status = HTTPStatus(answer.status)
-    fields: dict[str, Any] = {
-        "Connection": "close",
-        "Content-Length": str(len(answer.body)),
-        "Content-Type": answer.content_type,
-        **_ALWAYS,
-        **answer.headers,
-    }
-    return Response(status.value, status.phrase, Headers(fields), answer.body)

@@ -3,6 +3,9 @@
 The asyncio client of websockets imports OpenSSL and proxy support, a fifth of the memory of a
 runner. This module uses the layer below, which does no I/O:
 https://websockets.readthedocs.io/en/stable/howto/sansio.html
+
+That layer is also what websockets 10 (Debian 12, Ubuntu 24.04) and later versions have in common,
+by other names.
 """
 
 import asyncio
@@ -10,26 +13,29 @@ import socket as sockets
 from collections import deque
 from collections.abc import Mapping
 
-from websockets.client import ClientProtocol
 from websockets.exceptions import WebSocketException
 from websockets.frames import Frame, Opcode
-from websockets.protocol import State
 from websockets.uri import parse_uri
+
+try:
+    from websockets.client import ClientProtocol
+    from websockets.protocol import Protocol, State
+except ImportError:  # websockets 10
+    from websockets.client import ClientConnection as ClientProtocol
+    from websockets.connection import Connection as Protocol  # type: ignore[attr-defined]
+    from websockets.connection import State  # type: ignore[attr-defined]
 
 OPEN_SECONDS = 35.0
 """As long as for a request: a coordinator that waits for its daemon accepts nothing for 30 s."""
 CHUNK = 1 << 16
 
 
-class WebSocket:
-    """One connection.
-
-    There is no limit on frames of the own cell: they may be as large as descriptors.
-    """
+class Stream:
+    """Messages over one connection, for the client as for the server."""
 
     def __init__(
         self,
-        protocol: ClientProtocol,
+        protocol: Protocol,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
     ) -> None:
@@ -38,6 +44,67 @@ class WebSocket:
         self._writer = writer
         self._parts: list[Frame] = []
         self._messages: deque[str | bytes] = deque()
+        self._opening: object = None
+        """The first thing that was received: a response, or a request."""
+        self._is_over = False
+
+    async def recv(self) -> str | bytes:
+        """The next message. Raises OSError; ConnectionError if either side has closed."""
+        while not self._messages:
+            if self._protocol.state is not State.OPEN:
+                raise ConnectionError("it closed the connection")
+            await self._receive()
+        return self._messages.popleft()
+
+    def abort(self) -> None:
+        """Close at once, because the peer may be dead or hang."""
+        self._writer.transport.abort()
+
+    async def _receive(self) -> None:
+        self._feed(await self._reader.read(CHUNK))
+        self._flush()  # replies of the protocol layer itself, such as a pong
+        if self._writer.transport.get_write_buffer_size():
+            await self._writer.drain()  # a peer that reads none of them gets no more of them
+        for event in self._protocol.events_received():
+            if isinstance(event, Frame):
+                self._take(event)
+            else:
+                self._opening = event
+
+    def _feed(self, data: bytes) -> None:
+        try:
+            if data:
+                self._protocol.receive_data(data)
+            else:
+                self._protocol.receive_eof()
+        except (ValueError, EOFError, WebSocketException) as error:
+            # websockets 10 raises what later versions keep in handshake_exc.
+            raise ConnectionError(f"no valid HTTP: {error}") from error
+
+    def _take(self, frame: Frame) -> None:
+        if frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+            return
+        self._parts.append(frame)
+        if frame.fin:
+            data = b"".join(part.data for part in self._parts)
+            is_text = self._parts[0].opcode is Opcode.TEXT
+            self._messages.append(data.decode(errors="replace") if is_text else data)
+            self._parts.clear()
+
+    def _flush(self) -> None:
+        for data in self._protocol.data_to_send():
+            if data:
+                self._writer.write(data)
+            self._is_over |= not data  # the protocol layer sends nothing more
+
+
+class WebSocket(Stream):
+    """One connection to a server.
+
+    There is no limit on frames of the own cell: they may be as large as descriptors.
+    """
+
+    _protocol: ClientProtocol
 
     @classmethod
     async def connect(
@@ -81,45 +148,5 @@ class WebSocket:
         self._flush()
         await self._writer.drain()
 
-    async def recv(self) -> str | bytes:
-        """The next message. Raises OSError; ConnectionError if either side has closed."""
-        while not self._messages:
-            if self._protocol.state is not State.OPEN:
-                raise ConnectionError("it closed the connection")
-            await self._receive()
-        return self._messages.popleft()
 
-    def abort(self) -> None:
-        """Close at once, because the peer may be dead or hang."""
-        self._writer.transport.abort()
-
-    async def _receive(self) -> None:
-        data = await self._reader.read(CHUNK)
-        if data:
-            self._protocol.receive_data(data)
-        else:
-            self._protocol.receive_eof()
-        self._flush()  # replies of the protocol layer itself, such as a pong
-        if self._writer.transport.get_write_buffer_size():
-            await self._writer.drain()  # a peer that reads none of them gets no more of them
-        for event in self._protocol.events_received():
-            if isinstance(event, Frame):
-                self._take(event)
-
-    def _take(self, frame: Frame) -> None:
-        if frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
-            return
-        self._parts.append(frame)
-        if frame.fin:
-            data = b"".join(part.data for part in self._parts)
-            is_text = self._parts[0].opcode is Opcode.TEXT
-            self._messages.append(data.decode(errors="replace") if is_text else data)
-            self._parts.clear()
-
-    def _flush(self) -> None:
-        for data in self._protocol.data_to_send():
-            if data:
-                self._writer.write(data)
-
-
-__all__ = ["WebSocket", "WebSocketException"]
+__all__ = ["Stream", "WebSocket", "WebSocketException"]

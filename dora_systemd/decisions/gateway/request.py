@@ -32,10 +32,7 @@ class Answer:
 
 
 class Socket(Protocol):
-    """A WebSocket connection, as the server of websockets provides it.
-
-    A route need not catch its ConnectionClosed: the other end has disconnected.
-    """
+    """A WebSocket connection. A route need not catch its Gone: the other end has disconnected."""
 
     async def send(self, message: str | bytes | AsyncIterable[str]) -> None:
         """Send a message, whole or in parts; waits while the receiver is slow."""

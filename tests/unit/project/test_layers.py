@@ -47,7 +47,7 @@ ONLY_IMPORTERS = {
     "pydantic": {"decisions.settings.schema"},
     "pystemd": {"adapters.bus.library"},
     "systemd": {"adapters.journal.socket", "adapters.journal.reader", "adapters.host.notify"},
-    "websockets": {"adapters.dora.websocket", "gateway.server"},
+    "websockets": {"adapters.dora.websocket", "gateway.connection", "gateway.server"},
     "yaml": {"adapters.host.files", "adapters.host.yaml_loader"},
     "watchfiles": {"adapters.host.watch"},
 }
