@@ -217,6 +217,8 @@ def _state_of(cell: str, project: Path) -> dict[str, str]:
         status = Cell(cell).status
     states = status.nodes.values() if status else ()
     found["nodes"] = " ".join(map(_word, states))
+    # Two looks between restarts of a node in vain see the same state.
+    found["restarts"] = " ".join(str(one.restarts) for one in states)
     # A node can have died a moment before the runner hears of it.
     found["pids"] = str({at: one for at, one in pids_of(found).items() if at.startswith("node-")})
     found["stage"] = status.stage if status else ""
