@@ -89,7 +89,7 @@ bench-quick:  ## a few benchmarks in 3 minutes, their ratios beside the stored o
 	@$(PREPARE) container
 	@LAB=rivals tests/lab/lab run -- python -m benchmarks.quick $(WHAT)
 
-bookworm:  ## the checkout on Debian 12, with systemd 252, installed by pip
+bookworm:  ## the packages on Debian 12, with systemd 252, installed by apt
 	@$(PREPARE) container
 	@$(CHECK) bookworm
 

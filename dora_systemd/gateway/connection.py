@@ -9,20 +9,19 @@ from collections.abc import AsyncIterable, Callable
 from contextlib import suppress
 from email.utils import formatdate
 from http import HTTPStatus
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from websockets.datastructures import Headers
 from websockets.exceptions import WebSocketException
 from websockets.http11 import Request, Response
+from websockets.version import version
 
-from dora_systemd.adapters.dora.websocket import CHUNK, Stream
+from dora_systemd.adapters.dora.websocket import CHUNK, State, Stream
 from dora_systemd.decisions.gateway.request import Answer, text_answer
 
-try:
-    from websockets.protocol import State
+if TYPE_CHECKING or not version.startswith("10."):
     from websockets.server import ServerProtocol
-except ImportError:  # websockets 10
-    from websockets.connection import State  # type: ignore[attr-defined]
+else:
     from websockets.server import ServerConnection as ServerProtocol
 
 MAX_FRAME = 1024 * 1024

@@ -54,6 +54,11 @@ def switch_hot_reload(
     require_running(cell)
     refuse_parts([cell], "set")
     _refuse_release(cell)
+    if is_on:
+        # Imported late: asyncio is slow to import.
+        from dora_systemd.adapters.host.watch import require_watcher
+
+        require_watcher()
     unit = manager.read(cell.unit, ("FragmentPath", "Transient"))
     with ExitStack() as undo:
         remember(unit, HOT_RELOAD_FILE, f"{CHANGE_VARIABLE}={format_bool(is_on)}", undo)

@@ -1,4 +1,4 @@
-"""Debian 12 with systemd 252: the checkout installed by pip, as README.md says, and used."""
+"""Debian 12 with systemd 252: the packages installed by apt, and used."""
 
 import json
 import pwd
@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 
+from tests.deb.packages import install
 from tests.system.cells import Project, dora_processes, run, wait_for, wait_no_process
 
-CHECKOUT = Path(__file__).parents[2]
-VENV = "/opt/dora-systemd"
 LAB = "/opt/lab"
 """The environment of the tests, which is that of the nodes too."""
 USERS = ("root", "alice")
@@ -23,11 +22,8 @@ PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 
 @pytest.fixture(scope="module", autouse=True)
 def installed() -> None:
-    """The last two of the README's commands; there is no network here."""
-    offline = ("--quiet", "--no-index", "--find-links=/opt/wheels")
-    run(f"{VENV}/bin/pip", "install", *offline, str(CHECKOUT))
-    setup = run(f"{VENV}/bin/doractl", "setup")
-    assert setup.stderr == ""
+    """There is no network here: nothing else may be needed."""
+    install()
 
 
 @pytest.fixture
@@ -54,7 +50,7 @@ def as_user(user: str, *words: str, check: bool = True) -> CompletedProcess[str]
 
 
 def doractl(user: str, *words: str, check: bool = True) -> CompletedProcess[str]:
-    return as_user(user, f"{VENV}/bin/doractl", *words, check=check)
+    return as_user(user, "doractl", *words, check=check)
 
 
 def start(user: str, flow: Path, *words: str) -> CompletedProcess[str]:
@@ -114,11 +110,11 @@ def test_doctor_says_what_it_lacks(user: str) -> None:
     assert found["systemd"]["state"] == "note"
     for name in ("DelegateSubgroup", "RestartSteps", "PrivatePIDs"):
         assert name in found["systemd"]["text"]
-    assert found["dora"]["text"] == f"{VENV}/bin/dora, version 1.1.0"
+    assert found["dora"]["text"] == "/usr/bin/dora, version 1.1.0"
 
 
-def test_setup_is_understood() -> None:
-    units = [str(path) for path in Path("/usr/local/lib/systemd/system").glob("dora*.*")]
+def test_its_units_are_understood() -> None:
+    units = [str(path) for path in Path("/usr/lib/systemd/system").glob("dora*.*")]
     units = [unit for unit in units if not unit.endswith(".d")]
     assert len(units) == 4
     assert run("systemd-analyze", "verify", "--man=no", *units).stderr == ""
@@ -154,7 +150,7 @@ def test_a_network_of_its_own_and_a_directory_of_its_own(flow: Path) -> None:
     wait_for("it runs", lambda: row("root")["nodes_alive"] == 3)
     assert "doubler" in doractl("root", "dora", "robot", "--", "node", "list").stdout
     doractl("root", "up")
-    script = f'eval "$({VENV}/bin/doractl env)"; {VENV}/bin/dora node list'
+    script = 'eval "$(doractl env)"; dora node list'
     assert "doubler" in as_user("root", "bash", "-c", script).stdout
     doractl("root", "reload", "robot")
     doractl("root", "restart", "robot")
@@ -237,16 +233,20 @@ def test_start_and_enable(user: str, flow: Path) -> None:
     assert warnings(before) == []
 
 
-def test_setup_is_taken_away() -> None:
-    run(f"{VENV}/bin/doractl", "setup", "--remove")
-    assert not list(Path("/usr/local").rglob("*dora*"))
+def test_hot_reload_needs_what_debian_12_does_not_have(flow: Path) -> None:
+    done = doractl("root", "start", str(flow), "--venv", LAB, "--hot-reload", check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines() == [
+        "doractl: cannot use hot reload: this system has no Python package watchfiles",
+        "hint: doractl reload NAME takes up changes without it",
+    ]
 
 
 @pytest.mark.parametrize("user", USERS)
 def test_the_gateway(user: str, flow: Path) -> None:
     start(user, flow)
     assert "  ✓ Daemon ready\n" in doractl(user, "up").stdout
-    script = f'eval "$({VENV}/bin/doractl env)"; {VENV}/bin/dora list'
+    script = 'eval "$(doractl env)"; dora list'
     assert "robot" in as_user(user, "bash", "-c", script).stdout
     done = doractl(user, "destroy")
     assert "  ✓ robot stopped\n" in done.stdout

@@ -1,4 +1,4 @@
-"""LAB=bookworm: Debian 12, with what README.md has the admin install there before the checkout."""
+"""LAB=bookworm: Debian 12, with what the Debian packages need there."""
 
 import shutil
 from pathlib import Path
@@ -9,11 +9,8 @@ from lab.errors import Stage
 from lab.image import CERTIFICATES, debian_command, run_in_tree
 from lab.process import need_tools, run_logged
 
-VENV = "/opt/dora-systemd"
 # For the tests and for nodes: a user's dataflow has an environment of its own too.
 TEST_TOOLS = ["pytest", "pytest-timeout", "dora-rs==1.1.0", "pyarrow", "numpy"]
-# pip builds the checkout with it, and there is no network inside.
-BUILD_TOOLS = ["setuptools>=66"]
 
 
 def ensure_bookworm(cache: Path) -> Path:
@@ -23,7 +20,7 @@ def ensure_bookworm(cache: Path) -> Path:
 def bookworm_key() -> str:
     sources = [definition.read_part(definition.HERE / name) for name in ("bookworm.py", "setup.sh")]
     packages = [definition.OLD_SUITE, definition.OLD_PACKAGES]
-    return definition.digest(packages, definition.PYPI[0], definition.read_dependencies(), sources)
+    return definition.digest(packages, TEST_TOOLS, sources)
 
 
 def build(path: Path, cache: Path) -> None:
@@ -34,7 +31,7 @@ def build(path: Path, cache: Path) -> None:
     suite, packages = definition.OLD_SUITE, definition.OLD_PACKAGES
     with Stage(f"Debian {suite}, {len(packages)} packages"):
         run_logged(debian_command(path, "minbase", packages, suite), log, "install Debian's")
-    with Stage("from PyPI what the checkout needs"):
+    with Stage("from PyPI what tests and nodes need"):
         install_from_pypi(path, log)
     with Stage("users and units"):
         shutil.copy(definition.HERE / "setup.sh", path / "run/setup.sh")
@@ -43,10 +40,5 @@ def build(path: Path, cache: Path) -> None:
 
 
 def install_from_pypi(path: Path, log: Path) -> None:
-    """All but the checkout itself: pip would find the same for it."""
-    run_in_tree(path, ["python3", "-m", "venv", "--system-site-packages", VENV], log)
-    pip = [f"{VENV}/bin/pip", "install", "--no-cache-dir"]
-    run_in_tree(path, [*pip, *definition.read_dependencies(), definition.PYPI[0]], log)
-    run_in_tree(path, [f"{VENV}/bin/pip", "download", "--dest=/opt/wheels", *BUILD_TOOLS], log)
     run_in_tree(path, ["python3", "-m", "venv", "--system-site-packages", "/opt/lab"], log)
     run_in_tree(path, ["pip", "install", "--no-cache-dir", *TEST_TOOLS], log)

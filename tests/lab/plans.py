@@ -142,8 +142,10 @@ def packages_step() -> Step:
 
 
 def plan_bookworm(_form: str) -> list[Step]:
-    """The oldest systemd that the product takes, and the checkout installed there by pip."""
-    return [lab_step("tests on Debian 12", "bookworm", ["tests/bookworm"], minutes=2)]
+    """The oldest systemd that the product takes, and the packages installed there by apt."""
+    build = build_step()
+    step = lab_step("tests on Debian 12", "bookworm", ["tests/bookworm"], minutes=2)
+    return [build, replace(step, after=(build.name,))]
 
 
 def plan_system(form: str) -> list[Step]:

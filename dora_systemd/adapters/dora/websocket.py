@@ -10,20 +10,27 @@ by other names.
 
 import asyncio
 import socket as sockets
+import sys
 from collections import deque
 from collections.abc import Mapping
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from websockets.exceptions import WebSocketException
 from websockets.frames import Frame, Opcode
 from websockets.uri import parse_uri
+from websockets.version import version
 
-try:
+if TYPE_CHECKING or not version.startswith("10."):
     from websockets.client import ClientProtocol
     from websockets.protocol import Protocol, State
-except ImportError:  # websockets 10
+else:
+    # Its client and server also import those of earlier versions, and OpenSSL with them.
+    for _name in ("legacy", "legacy.client", "legacy.server"):
+        sys.modules.setdefault(f"websockets.{_name}", ModuleType(_name))
     from websockets.client import ClientConnection as ClientProtocol
-    from websockets.connection import Connection as Protocol  # type: ignore[attr-defined]
-    from websockets.connection import State  # type: ignore[attr-defined]
+    from websockets.connection import Connection as Protocol
+    from websockets.connection import State
 
 OPEN_SECONDS = 35.0
 """As long as for a request: a coordinator that waits for its daemon accepts nothing for 30 s."""
@@ -149,4 +156,4 @@ class WebSocket(Stream):
         await self._writer.drain()
 
 
-__all__ = ["Stream", "WebSocket", "WebSocketException"]
+__all__ = ["State", "Stream", "WebSocket", "WebSocketException"]

@@ -6,6 +6,7 @@ import errno
 import os
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,13 @@ IDLE_MS = 5000
 _NEW_SECONDS = 0.25
 """Time after which new watches usually exist."""
 _GONE_SECONDS = 0.25
+
+
+def require_watcher(find: Callable[[str], object] = find_spec) -> None:
+    """Raise DoraSystemdError if no file can be watched: Debian 12 has no package of watchfiles."""
+    if find("watchfiles") is None:
+        message = "cannot use hot reload: this system has no Python package watchfiles"
+        raise DoraSystemdError(message, "doractl reload NAME takes up changes without it")
 
 
 class Identity(NamedTuple):

@@ -187,6 +187,11 @@ def _make_plan(
         addresses=request.addresses,
     )
     options = with_settings(options, settings)
+    if options.hot_reload:
+        # Imported late: few dataflows have it, and asyncio is slow to import.
+        from dora_systemd.adapters.host.watch import require_watcher
+
+        require_watcher()
     options, members = _spread(dataflow, options, settings, variables)
     called = called_variables(dataflow, request.caller)
     environment = unit_environment(search_path, venv, {**called, **variables})

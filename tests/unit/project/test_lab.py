@@ -27,9 +27,12 @@ from tests.system.tolerated import TOLERATED, is_tolerated
 PYPROJECT = '[project]\nname = "x"\n[tool.ruff]\nline-length = 100\n'
 
 
-def test_debian_12_gets_what_the_readme_asks_for() -> None:
-    readme = definition.read_part(definition.CHECKOUT / "README.md")
-    assert f"\napt install {' '.join(definition.README_PACKAGES)}\n" in readme
+def test_debian_12_gets_what_the_package_asks_for() -> None:
+    control = definition.read_part(definition.CHECKOUT / "packaging/debian/control")
+    depends = re.search(r"^Depends: (.*?)^Recommends:", control, re.M | re.S)
+    assert depends is not None
+    wanted = set(re.findall(r"python3-\w+", depends[1]))
+    assert wanted == set(definition.OLD_PACKAGES) & {*wanted}
 
 
 def test_options_of_run() -> None:

@@ -104,7 +104,10 @@ LATE = {
         "gateway.control.logs": {"decisions.machines.elsewhere"},
         "gateway.live.lines": {"decisions.machines.elsewhere"},
         "cli.foreground": {"verbs.facts.machines", "verbs.remote.attached"},
-        "verbs.start.plan": {"adapters.host.addresses", "decisions.machines.spread"},
+        "verbs.start.plan": {
+            *("adapters.host.addresses", "adapters.host.watch"),
+            "decisions.machines.spread",
+        },
         "verbs.why": {"verbs.facts.machines", "verbs.releases.listing"},
         "verbs.start.unit": {"decisions.machines.link_unit"},
         "verbs.start.claim": {"decisions.machines.link_unit"},
@@ -118,6 +121,7 @@ LATE = {
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},
+        "verbs.reload": {"adapters.host.watch"},
         "verbs.start.watch": {"adapters.host.watch"},
     },
     "a list without dataflows has no node": {

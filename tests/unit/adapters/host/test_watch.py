@@ -11,6 +11,7 @@ import watchfiles
 
 from dora_systemd.adapters.host import watch
 from dora_systemd.decisions.reload.watch_rules import WatchRules
+from dora_systemd.errors import DoraSystemdError
 
 SECONDS = 20.0
 
@@ -185,3 +186,12 @@ def test_a_project_that_is_replaced(tmp_path: Path, name: str, is_back: bool, co
         task.cancel()
 
     asyncio.run(work())
+
+
+def test_hot_reload_where_nothing_can_watch_files() -> None:
+    watch.require_watcher()
+    with pytest.raises(DoraSystemdError) as caught:
+        watch.require_watcher(lambda _: None)
+    assert caught.value.message == (
+        "cannot use hot reload: this system has no Python package watchfiles"
+    )
