@@ -196,6 +196,17 @@ def test_lines_may_repeat_where_the_runner_is_killed() -> None:
     assert check(replace(GOOD, lines=twice, answers=killed)) == []
 
 
+def test_pid_1_records_nothing_while_it_starts_anew_beside_journald() -> None:
+    row = {**ROW, "restarts": 1}
+    counted = replace(GOOD, **last(view(row, row, NRestarts="1")))
+    beside = (answer(1, "journald-restarts"), answer(2, "daemon-reexec"))
+    apart = (answer(0, "journald-restarts"), answer(2, "daemon-reexec"))
+    for faults, is_broken in ((beside, False), (apart, True)):
+        complaints = check(replace(counted, answers=(*GOOD.answers, *faults)))
+        broken = {one.invariant for one in complaints}
+        assert ("why_lists_each_restart" in broken) is is_broken, complaints
+
+
 def test_a_new_journald_knows_no_unit_of_a_process_that_was_killed() -> None:
     faults = (answer(2, "kill-runner"), answer(2, "journald-restarts"))
     assert check(replace(GOOD, lines=NAMELESS, answers=(*GOOD.answers, *faults))) == []
