@@ -108,8 +108,12 @@ deb:  ## the Debian packages, built twice and checked, into dist/
 	@$(PREPARE) container
 	@packaging/build
 
+wheels:  ## wheels of dora-systemd, pystemd and systemd-python, into dist/wheels, for uv and pipx
+	@$(PREPARE) container
+	@packaging/wheels
+
 autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has built
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm faults history power fuzz mutants browser machines bench bench-quick bookworm lint demo clean deb autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm faults history power fuzz mutants browser machines bench bench-quick bookworm lint demo clean deb wheels autopkgtest

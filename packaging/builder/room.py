@@ -52,16 +52,20 @@ def build_dependencies(*controls: Path) -> list[str]:
 
 def ensure_room(cache: Path, packages: Sequence[str]) -> Path:
     """The tree with these packages, built if it is not there."""
-    names = sorted({*packages, *TOOLS, "debhelper"})
-    key = definition.digest(definition.SUITE, names)
-    return ensure(cache, Layer("room", key, lambda path: build_room(path, names, cache)))
+    return ensure_suite(cache, definition.SUITE, sorted({*packages, *TOOLS, "debhelper"}))
 
 
-def build_room(path: Path, packages: Sequence[str], cache: Path) -> None:
+def ensure_suite(cache: Path, suite: str, packages: Sequence[str]) -> Path:
+    """The tree of a release of Debian with these packages, built if it is not there."""
+    key = definition.digest(suite, packages)
+    return ensure(cache, Layer("room", key, lambda path: build_room(path, suite, packages, cache)))
+
+
+def build_room(path: Path, suite: str, packages: Sequence[str], cache: Path) -> None:
     """A Debian with build-essential and `packages`."""
     need_tools("mmdebstrap")
-    with Stage(f"Debian {definition.SUITE} to build in, {len(packages)} packages"):
-        command = debian_command(path, "buildd", list(packages))
+    with Stage(f"Debian {suite} to build in, {len(packages)} packages"):
+        command = debian_command(path, "buildd", list(packages), suite)
         run_logged(command, cache / "room.log", "make the tree to build in")
 
 

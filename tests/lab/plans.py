@@ -53,7 +53,8 @@ def plan_test(form: str) -> list[Step]:
     queue = [replace(one, after=(unit.name,)) for one in plan_system("container")]
     inside, several = (replace(one, after=(unit.name,)) for one in (inside, several))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
-    lane = [build, packages_step(), *plan_lab(form), *plan_other_python(form)]
+    oldest = plan_bookworm(form)[1:]
+    lane = [build, packages_step(), *oldest, *plan_lab(form), *plan_other_python(form)]
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
     return [unit, several, *in_a_row(lane, unit), inside, restarted, *queue]
 
@@ -142,10 +143,10 @@ def packages_step() -> Step:
 
 
 def plan_bookworm(_form: str) -> list[Step]:
-    """The oldest systemd that the product takes, and the packages installed there by apt."""
-    build = build_step()
+    """The oldest systemd that the product takes, where apt installs the packages, and uv wheels."""
+    built = [build_step(), Step("wheels", ["packaging/wheels"], os.environ.copy, minutes=2)]
     step = lab_step("tests on Debian 12", "bookworm", ["tests/bookworm"], minutes=2)
-    return [build, replace(step, after=(build.name,))]
+    return [*built, replace(step, after=tuple(one.name for one in built))]
 
 
 def plan_system(form: str) -> list[Step]:

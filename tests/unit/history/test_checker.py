@@ -190,6 +190,14 @@ def test_counted_lines_may_be_missing() -> None:
     assert check(replace(GOOD, printed={(A, "sink.1"): 5}, lost={A: 2})) == []
 
 
+def test_lines_may_be_missing_where_no_runner_could_follow_the_killed_one() -> None:
+    lost = replace(GOOD, printed={(A, "sink.1"): 5})
+    killed = (*GOOD.answers, replace(answer(2, "kill-runner"), step=Step("kill-runner", A)))
+    away = replace(answer(2, "project-deleted"), step=Step("project-deleted", A))
+    assert check(replace(lost, answers=killed)) != []
+    assert check(replace(lost, answers=(*killed, away))) == []
+
+
 def test_lines_may_repeat_where_the_runner_is_killed() -> None:
     twice = (*GOOD.lines, Line(A, "sink.1", 2))
     killed = (*GOOD.answers, answer(2, "kill-runner"))
