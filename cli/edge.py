@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, TextIO
 
-from dora_systemd.errors import DoraSystemdError
-from dora_systemd.names import REACHED_AS
+from dora_systemd.errors import REACHED_AS, DoraSystemdError
 from dora_systemd.terminal_text import escaped, one_line
 
 _STANDARD = ("stdin", "stdout", "stderr")

@@ -4,6 +4,9 @@ import os
 from collections.abc import Sequence
 from enum import IntEnum
 
+REACHED_AS = "DORACTL_REACHED_AS"
+"""The variable that tells doractl on another host by what -H it was called."""
+
 
 class ExitCode(IntEnum):
     """Exit status of doractl, as doractl(1) lists it.

@@ -11,8 +11,6 @@ from typing import Protocol
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
-REACHED_AS = "DORACTL_REACHED_AS"
-"""The variable that tells doractl on another host by what -H it was called."""
 UNIT_PREFIX = "dora-"
 UNIT_SUFFIX = ".service"
 LINK_PREFIX = "doralink-"

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from enum import Enum
 
 from dora_systemd.decisions.remote.hosts import Host
-from dora_systemd.names import REACHED_AS
+from dora_systemd.errors import REACHED_AS
 
 CONNECT_SECONDS = 5
 """For the connection, until ssh knows that a server speaks there."""

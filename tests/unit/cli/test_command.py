@@ -321,6 +321,18 @@ def test_list_loads_little(more: str, most: int) -> None:
     assert len(ours) <= most, sorted(ours)
 
 
+def test_version_loads_next_to_nothing() -> None:
+    script = "import sys, dora_systemd.cli.main; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    ours = {name for name in done.stdout.split() if name.startswith("dora_systemd.")}
+    assert ours == {
+        *("dora_systemd.cli", "dora_systemd.cli.main", "dora_systemd.cli.edge"),
+        *("dora_systemd.errors", "dora_systemd.terminal_text"),
+    }
+
+
 @pytest.mark.parametrize("verb", ["start", "run"])
 def test_settings_stand_by_concern_with_their_defaults(
     capsys: pytest.CaptureFixture[str], verb: str
