@@ -255,6 +255,8 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
         return {**nodes, event.node: old._replace(pid=pid)}, None
     if old.state == "failed" and old.policy == "never" and event.exit == old.exit:
         return nodes, None  # its launcher, which ends as the node did
+    if old.state in ("failed", "finished") and not (old.pid or old.machine):
+        return nodes, None  # the process that it has replaced, which ends only now
     if event.will_restart and old.policy in (HELD, LATCHED):
         # Dora's restart is not one: it waits for a reload, or for what the node needs.
         event = replace(event, will_restart=False)

@@ -228,6 +228,12 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
         RUNS._replace(restarts=2),
         (crashed(), RESTARTED),
     ),
+    "the end of the process before, after that of the new one": (
+        RUNS._replace(state="failed", pid=0, exit=CRASH, policy="never"),
+        exited(exit_of(-15)),
+        RUNS._replace(state="failed", pid=0, exit=CRASH, policy="never"),
+        (),
+    ),
     "one that waits for a reload": (
         RUNS._replace(policy=HELD),
         exited(again=True),
