@@ -56,7 +56,7 @@ def build_wheels(cache: Path, place: Path, suite: str) -> Path:
 
 
 def deliver(wheels: Sequence[Path]) -> None:
-    """Put them where README.md has uv look for them, with a file of checksums."""
+    """Put them where docs/install.md has uv look for them, with a file of checksums."""
     shutil.rmtree(OUT, ignore_errors=True)
     OUT.mkdir(parents=True)
     for wheel in wheels:

@@ -31,10 +31,10 @@ def as_user(line: str, check: bool = True) -> CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def installed() -> Iterator[None]:
-    """By the line of README.md, on a machine without the packages."""
+    """By the line of docs/install.md, on a machine without the packages."""
     run("dpkg", "--purge", "dora-systemd", "dora-cli")
-    readme = (CHECKOUT / "README.md").read_text()
-    (line,) = re.findall(r"^uv tool install .*$", readme, re.MULTILINE)
+    page = (CHECKOUT / "docs/install.md").read_text()
+    (line,) = re.findall(r"^uv tool install .*$", page, re.MULTILINE)
     as_user(f"{line.replace('uv tool install', OFFLINE)} --python /usr/bin/python3")
     yield
     as_user("doractl setup --remove && uv tool uninstall dora-systemd")

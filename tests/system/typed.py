@@ -124,15 +124,21 @@ class Shell:
         os.close(self._ours)
 
 
+def type_line(shell: Shell, typed: Typed) -> tuple[str, int]:
+    """What a line shows, and its status; one that only looks is typed until it shows what fits."""
+    end = time.monotonic() + bound(LOOK_SECONDS)
+    seen = shell.run(typed.line)
+    while not typed.fits(*seen) and LOOKS.match(typed.line) and time.monotonic() < end:
+        time.sleep(0.5)
+        seen = shell.run(typed.line)
+    return seen
+
+
 def replay(shell: Shell, text: str) -> list[str]:
     """Type the lines in a text; those that differ, as they were. All are printed as such a text."""
     wrong = []
     for typed in typed_lines(text):
-        end = time.monotonic() + bound(LOOK_SECONDS)
-        seen = shell.run(typed.line)
-        while not typed.fits(*seen) and LOOKS.match(typed.line) and time.monotonic() < end:
-            time.sleep(0.5)
-            seen = shell.run(typed.line)
+        seen = type_line(shell, typed)
         told = as_text(typed.line, *seen)
         print(told if typed.shown is not None else f"% {typed.line}\n", end="")
         if not typed.fits(*seen):

@@ -22,7 +22,10 @@ from tests.unit.checkout import CHECKOUT
 from tests.unit.project.test_manpages import PAGES, all_verbs
 from tests.unit.project.test_words import MODULES, strings
 
-MARKDOWN = [CHECKOUT / name for name in ("README.md", "HACKING.md", "CHANGELOG.md", "SECURITY.md")]
+MARKDOWN = [
+    *(CHECKOUT / name for name in ("README.md", "HACKING.md", "CHANGELOG.md", "SECURITY.md")),
+    *sorted((CHECKOUT / "docs").glob("*.md")),
+]
 TASKS = sorted((CHECKOUT / "tests/system/transcripts").glob("*.txt"))
 ROFF = {r"\-": "-", r"\(aq": "'", r"\&": "", r"\e": "\\"}
 CATALOG = CHECKOUT / "units/templates/dora-systemd.catalog"

@@ -18,6 +18,7 @@ SMELLS = (
 PATTERN = re.compile("|".join(rf"(?<!\w){re.escape(one)}(?!\w)" for one in SMELLS), re.I)
 TEXTS = (
     CHECKOUT / "README.md",
+    *sorted((CHECKOUT / "docs").glob("*.md")),
     CHECKOUT / "units/templates/dora-systemd.catalog",
     *sorted((CHECKOUT / "packaging/man").iterdir()),
     *sorted((CHECKOUT / "dora_systemd/gateway/static").glob("*.html")),
