@@ -253,10 +253,8 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
         # The process before this wait, or a launcher that was replaced: neither is a crash.
         pid = old.pid if event.is_stale else 0
         return {**nodes, event.node: old._replace(pid=pid)}, None
-    if old.state == "failed" and old.policy == "never" and event.exit == old.exit:
-        return nodes, None  # its launcher, which ends as the node did
-    if old.state in ("failed", "finished") and not (old.pid or old.machine):
-        return nodes, None  # the process that it has replaced, which ends only now
+    if _is_of_another(old, event):
+        return nodes, None
     if event.will_restart and old.policy in (HELD, LATCHED):
         # Dora's restart is not one: it waits for a reload, or for what the node needs.
         event = replace(event, will_restart=False)
@@ -284,6 +282,15 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
         needs="",
     )
     return nodes, record
+
+
+def _is_of_another(old: NodeStatus, event: life.NodeExited) -> bool:
+    """Whether a node that has ended has ended already, and this is of another process.
+
+    That is its launcher, which ends as the node did, or the process that it has replaced.
+    """
+    is_launcher = old.state == "failed" and old.policy == "never" and event.exit == old.exit
+    return is_launcher or (old.state in ("failed", "finished") and not (old.pid or old.machine))
 
 
 def _exited_as_told(nodes: NodeTable, event: life.NodeExited, old: NodeStatus) -> Change:
