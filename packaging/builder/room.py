@@ -52,13 +52,16 @@ def build_dependencies(*controls: Path) -> list[str]:
 
 def ensure_room(cache: Path, packages: Sequence[str]) -> Path:
     """The tree with these packages, built if it is not there."""
-    return ensure_suite(cache, definition.SUITE, sorted({*packages, *TOOLS, "debhelper"}))
+    return ensure_suite(cache, "room", definition.SUITE, sorted({*packages, *TOOLS, "debhelper"}))
 
 
-def ensure_suite(cache: Path, suite: str, packages: Sequence[str]) -> Path:
-    """The tree of a release of Debian with these packages, built if it is not there."""
+def ensure_suite(cache: Path, kind: str, suite: str, packages: Sequence[str]) -> Path:
+    """The tree of a release of Debian with these packages, built if it is not there.
+
+    kind: of the layer; the cache keeps two of each.
+    """
     key = definition.digest(suite, packages)
-    return ensure(cache, Layer("room", key, lambda path: build_room(path, suite, packages, cache)))
+    return ensure(cache, Layer(kind, key, lambda path: build_room(path, suite, packages, cache)))
 
 
 def build_room(path: Path, suite: str, packages: Sequence[str], cache: Path) -> None:

@@ -41,7 +41,7 @@ def main(suites: Sequence[str]) -> int:
 
 def build_wheels(cache: Path, place: Path, suite: str) -> Path:
     """The directory with the wheels for the Python of a release of Debian."""
-    room = ensure_suite(cache, suite, PACKAGES)
+    room = ensure_suite(cache, "wheelroom", suite, PACKAGES)
     build = place / suite
     source = build / "dora-systemd"
     source.mkdir(parents=True)
