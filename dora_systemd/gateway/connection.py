@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 from websockets.datastructures import Headers
 from websockets.exceptions import WebSocketException
 from websockets.http11 import Request, Response
-from websockets.version import version
 
-from dora_systemd.adapters.dora.websocket import CHUNK, State, Stream
+from dora_systemd.adapters.dora.websocket import CHUNK, IS_OLD, State, Stream
 from dora_systemd.decisions.gateway.request import Answer, text_answer
 
-if TYPE_CHECKING or not version.startswith("10."):
+if TYPE_CHECKING or not IS_OLD:
     from websockets.server import ServerProtocol
 else:
     from websockets.server import ServerConnection as ServerProtocol
@@ -120,10 +119,6 @@ class ServerSocket(Stream):
             send = self._protocol.send_continuation
             await self._push()
         send(b"", fin=True)
-
-    async def _push(self) -> None:
-        self._flush()
-        await self._writer.drain()
 
     async def close(self, code: int = 1000, reason: str = "") -> None:
         """Send a closing frame; who reads sees the end, at the latest after _CLOSE_SECONDS."""

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lab import definition
+from lab.bookworm import COMPILED
 from lab.cache import find_cache
 from lab.errors import LabError, Stage, say
 from lab.process import need_root
@@ -21,7 +22,6 @@ from builder.sources import CHECKOUT, SOURCES, copy_files, list_checkout, read_d
 
 SUITES = (definition.OLD_SUITE, definition.SUITE)
 PACKAGES = ("libsystemd-dev", "pkgconf", "python3-dev", "python3-pip", "python3-setuptools")
-LIBRARIES = ("pystemd", "systemd-python")
 OUT = CHECKOUT / "dist/wheels"
 
 
@@ -50,7 +50,7 @@ def build_wheels(cache: Path, place: Path, suite: str) -> Path:
     command = ["pip", "wheel", "--no-deps", "--no-cache-dir", "--wheel-dir=wheels"]
     network = network_environment(build)
     with Stage(f"wheels for the Python of Debian {suite}"):
-        words = [*command, "./dora-systemd", *LIBRARIES]
+        words = [*command, "./dora-systemd", *COMPILED]
         run_in_room(room, build, words, network, has_network=True)
     return build / "wheels"
 

@@ -10,6 +10,7 @@ from subprocess import CompletedProcess
 
 import pytest
 
+from tests.bookworm import test_bookworm
 from tests.system.cells import Project, run, wait_for, wait_no_process
 
 CHECKOUT = Path(__file__).parents[2]
@@ -20,13 +21,10 @@ OFFLINE = "uv tool install --offline --no-index --find-links /opt/wheels"
 
 
 def as_user(line: str, check: bool = True) -> CompletedProcess[str]:
-    """A line in the shell of the user, who has logged in."""
-    entry = pwd.getpwnam(USER)
+    """Run a line in a shell of USER, which finds uv and what uv has installed."""
     path = f"{HOME}/.local/bin:/opt/lab/bin:/usr/bin:/bin"
-    env = {"PATH": path, "LANG": "C.UTF-8", "HOME": str(HOME)}
-    env["XDG_RUNTIME_DIR"] = f"/run/user/{entry.pw_uid}"
-    switch = ("setpriv", f"--reuid={USER}", f"--regid={USER}", "--init-groups")
-    return run(*switch, "sh", "-c", line, env=env, cwd=str(CHECKOUT), check=check)
+    shell = ("sh", "-c", f"PATH={path}; cd {CHECKOUT}; {line}")
+    return test_bookworm.as_user(USER, *shell, check=check)
 
 
 @pytest.fixture(scope="module")

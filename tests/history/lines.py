@@ -35,20 +35,20 @@ def every_line_once(history: History) -> Iterator[str]:
 
 
 def _has_no_successor(history: History, cell: str) -> bool:
-    """Whether a runner was killed, and systemd could start none: its project was away."""
+    """Whether a runner was killed, and systemd could start no other: the project was away."""
     hits = [one.step.what for one in history.answers if one.step.cell == cell and not one.status]
-    return "project-deleted" in hits and any(
-        what in FAULTS and FAULTS[what].kills_runner for what in hits
-    )
+    return "project-deleted" in hits and _kills_runner(hits)
 
 
 def _forgets(history: History) -> bool:
     """Whether journald was restarted, and a runner killed: of a process that has ended since the
     line was sent, a new journald finds no unit."""
     hits = [one.step.what for one in history.answers if one.status == 0]
-    return "journald-restarts" in hits and any(
-        what in FAULTS and FAULTS[what].kills_runner for what in hits
-    )
+    return "journald-restarts" in hits and _kills_runner(hits)
+
+
+def _kills_runner(hits: Sequence[str]) -> bool:
+    return any(what in FAULTS and FAULTS[what].kills_runner for what in hits)
 
 
 def _wrong(history: History, cell: str, numbers: Sequence[int]) -> Iterator[str]:

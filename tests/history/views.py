@@ -140,7 +140,7 @@ def why_lists_each_restart(history: History) -> Iterator[str]:
 
 
 def _is_systemd_mute(history: History, at: int) -> bool:
-    """Whether PID 1 executed itself anew while journald restarted: it records nothing then."""
+    """Whether PID 1 executed itself again while journald restarted: PID 1 records nothing then."""
     hits = {one.at: one.step.what for one in history.answers if one.at <= at}
     return any(
         {hits.get(step), hits.get(step + 1)} == {"journald-restarts", "daemon-reexec"}

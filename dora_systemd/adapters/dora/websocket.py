@@ -21,7 +21,9 @@ from websockets.frames import Frame, Opcode
 from websockets.uri import parse_uri
 from websockets.version import version
 
-if TYPE_CHECKING or not version.startswith("10."):
+IS_OLD = version.startswith("10.")
+
+if TYPE_CHECKING or not IS_OLD:
     from websockets.client import ClientProtocol
     from websockets.protocol import Protocol, State
 else:
@@ -104,6 +106,10 @@ class Stream:
                 self._writer.write(data)
             self._is_over |= not data  # the protocol layer sends nothing more
 
+    async def _push(self) -> None:
+        self._flush()
+        await self._writer.drain()
+
 
 class WebSocket(Stream):
     """One connection to a server.
@@ -152,8 +158,7 @@ class WebSocket(Stream):
     async def send(self, text: str) -> None:
         """Send a message. Raises OSError, and WebSocketException if the connection is closed."""
         self._protocol.send_text(text.encode())
-        self._flush()
-        await self._writer.drain()
+        await self._push()
 
 
-__all__ = ["State", "Stream", "WebSocket", "WebSocketException"]
+__all__ = ["IS_OLD", "State", "Stream", "WebSocket", "WebSocketException"]

@@ -204,7 +204,7 @@ def test_lines_may_repeat_where_the_runner_is_killed() -> None:
     assert check(replace(GOOD, lines=twice, answers=killed)) == []
 
 
-def test_pid_1_records_nothing_while_it_starts_anew_beside_journald() -> None:
+def test_pid_1_records_nothing_while_it_and_journald_restart() -> None:
     row = {**ROW, "restarts": 1}
     counted = replace(GOOD, **last(view(row, row, NRestarts="1")))
     beside = (answer(1, "journald-restarts"), answer(2, "daemon-reexec"))

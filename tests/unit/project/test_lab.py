@@ -32,7 +32,7 @@ def test_debian_12_gets_what_the_package_asks_for() -> None:
     depends = re.search(r"^Depends: (.*?)^Recommends:", control, re.M | re.S)
     assert depends is not None
     wanted = set(re.findall(r"python3-\w+", depends[1]))
-    assert wanted == set(definition.OLD_PACKAGES) & {*wanted}
+    assert wanted <= set(definition.OLD_PACKAGES)
 
 
 def test_options_of_run() -> None:
