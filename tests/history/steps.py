@@ -152,8 +152,9 @@ FAULTS = {
     ),
     "project-swapped": Fault(_SWAP),
     "project-read-only": Fault(
-        'mount --bind "$place/project" "$place/project"'
-        ' && mount -o remount,bind,ro "$place/project"',
+        # A step beside this one may just put another directory in its place.
+        'mount --bind "$place/project" "$place/project" || exit 3; '
+        'mount -o remount,bind,ro "$place/project"',
         'mountpoint -q "$place/project" && umount -l "$place/project"',
     ),
     "directory-deleted": Fault('rm -r "/run/dora-systemd/$name"', weight=1),
