@@ -17,7 +17,7 @@ from dora_systemd.adapters.runner_socket.client import (
     error_reply,
     parse_line,
 )
-from dora_systemd.adapters.runner_socket.splice import Ends, splice, taken_over
+from dora_systemd.adapters.runner_socket.splice import Ends, Writer, splice, taken_over
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 
@@ -48,7 +48,7 @@ async def serve(
     """
     limit = MAX_SESSION_LINE if sessions else MAX_BYTES
 
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def talk(reader: asyncio.StreamReader, writer: Writer) -> None:
         with contextlib.suppress(OSError, ValueError):
             request = parse_line(await reader.readline())
             verb = str(request.get("verb")) if request else ""
@@ -108,6 +108,6 @@ async def refuse(caller: Ends, error: DoraSystemdError) -> None:
     await _send(caller.writer, error_reply(error))
 
 
-async def _send(writer: asyncio.StreamWriter, reply: Mapping[str, Any]) -> None:
+async def _send(writer: Writer, reply: Mapping[str, Any]) -> None:
     writer.write(json.dumps(reply).encode() + b"\n")
     await writer.drain()

@@ -3,16 +3,39 @@
 import asyncio
 import contextlib
 import socket
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 _CHUNK = 1 << 16
+
+
+class Transport(Protocol):
+    """What is used of an asyncio.WriteTransport."""
+
+    def abort(self) -> None: ...
+
+    def get_write_buffer_size(self) -> int: ...
+
+
+class Writer(Protocol):
+    """What is used of an asyncio.StreamWriter."""
+
+    @property
+    def transport(self) -> Transport: ...
+
+    def write(self, data: bytes) -> None: ...
+
+    async def drain(self) -> None: ...
+
+    def is_closing(self) -> bool: ...
+
+    def close(self) -> None: ...
 
 
 class Ends(NamedTuple):
     """The two streams of one connection."""
 
     reader: asyncio.StreamReader
-    writer: asyncio.StreamWriter
+    writer: Writer
 
 
 async def taken_over(connection: socket.socket, said: bytes, limit: int) -> Ends:
@@ -45,7 +68,7 @@ async def splice(one: Ends, other: Ends) -> None:
         other.writer.close()
 
 
-async def _pass(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _pass(reader: asyncio.StreamReader, writer: Writer) -> None:
     with contextlib.suppress(OSError):
         while data := await reader.read(_CHUNK):
             writer.write(data)

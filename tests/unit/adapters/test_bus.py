@@ -1,5 +1,6 @@
 """D-Bus without a bus: how values are sent, and what its errors become."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,12 @@ from hypothesis import strategies as st
 from dora_systemd.adapters.bus import connection
 from dora_systemd.adapters.bus import errors as bus_errors
 from dora_systemd.adapters.bus import systemd as bus
+from dora_systemd.adapters.bus.manager import Observer
 from dora_systemd.adapters.bus.wire import decoded, encoded
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import fake_systemd
-from tests.unit.fakes.manager import FakeManager, ScopeIn
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
 SYSTEM = Scope(is_user=False, uid=0)
 USER = Scope(is_user=True, uid=1000)
@@ -127,73 +129,73 @@ def test_names_of_pystemds_errors() -> None:
         raise DBusBaseError
 
 
-class Departing(bus.Bus):
-    """Units of which some end before they can be stopped."""
+class DBusBaseError(Exception):
+    """The class of all errors of pystemd."""
 
-    def __init__(self, code: ExitCode) -> None:
-        self.code = code
+    errno = -110
+    err_name = ""
 
-    def _listen(self, unit: str) -> None:
-        del unit
-
-    def _call(self, action: str, method: str, *arguments: Any, **more: Any) -> str:
-        del method, more
-        unit = arguments[0][1]
-        if unit == "gone":
-            raise DoraSystemdError(f"cannot {action}", "", self.code)
-        return f"/job/{unit}"
-
-    def _wait_for_jobs(self, jobs: dict[str, str], observer: object) -> dict[str, str]:
-        del observer
-        return dict.fromkeys(jobs.values(), "failed")
+    def __init__(self, name: str = "", message: str = "") -> None:
+        super().__init__(name, message)
+        self.err_name, self.err_message = name, message
 
 
-def test_a_unit_that_is_gone_is_stopped() -> None:
-    systemd = Departing(ExitCode.NOT_FOUND)
+class Departing(FakeManager):
+    """A manager about whose unit "gone" systemd says `error`: it ends before it can be stopped."""
+
+    def __init__(self, error: str) -> None:
+        super().__init__()
+        self.error = DBusBaseError(f"org.freedesktop.systemd1.{error}")
+        self.units["other"] = {}
+        self.job_results["other"] = "failed"
+
+    def run_jobs(
+        self, method: str, units: Sequence[str], observer: Observer | None = None
+    ) -> dict[str, str]:
+        if "gone" in units:
+            raise self.error
+        return super().run_jobs(method, units, observer)
+
+
+def test_a_unit_that_is_gone_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_systemd(monkeypatch, Departing("NoSuchUnit"))
+    systemd = bus.Bus(SYSTEM)
     assert systemd.run_jobs("StopUnit", ["gone", "other"]) == {"gone": "done", "other": "failed"}
-    with pytest.raises(DoraSystemdError):
+    with pytest.raises(DoraSystemdError, match="there is no such unit"):
         systemd.run_jobs("RestartUnit", ["gone"])
-    with pytest.raises(DoraSystemdError):
-        Departing(ExitCode.NO_PERMISSION).run_jobs("StopUnit", ["gone"])
-
-
-class Freezer(bus.Bus):
-    """A unit in a state of its freezer; the methods that were called."""
-
-    def __init__(self, state: str) -> None:
-        self.scope = SYSTEM
-        self.state = state
-        self.called: list[str] = []
-
-    def _listen(self, unit: str) -> None:
-        del unit
-
-    def _call(self, action: str, method: str, *arguments: Any, **more: Any) -> str:
-        del action, more
-        if method != "Get":
-            self.called.append(method)
-            return "/job/1"
-        return self.state if arguments[1][1] == "FreezerState" else "dora.slice"
+    fake_systemd(monkeypatch, Departing("AccessDenied"))
+    with pytest.raises(DoraSystemdError, match="permission denied"):
+        bus.Bus(SYSTEM).run_jobs("StopUnit", ["gone"])
 
 
 @pytest.mark.parametrize("state", ["running", "frozen"])
-def test_nothing_frozen_is_stopped_or_killed(state: str) -> None:
-    systemd = Freezer(state)
-    thaw = ["ThawUnit"] if state == "frozen" else []
-    systemd.queue_job("StopUnit", "x.service")
-    systemd.queue_job("RestartUnit", "x.service")
-    systemd.kill("x.service", 9)
-    assert systemd.called == [*thaw, "StopUnit", *thaw, "RestartUnit", *thaw, "KillUnit"]
-    systemd.queue_job("StartUnit", "x.service")
-    assert systemd.called[-2:] == ["KillUnit", "StartUnit"]
+def test_nothing_frozen_is_stopped_or_killed(state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = FakeManager()
+    unit = manager.add(options())
+    fake_systemd(monkeypatch, manager)
+    systemd = bus.Bus(SYSTEM)
+
+    def calls_of(act: Callable[[], object]) -> list[str]:
+        manager.units[unit]["FreezerState"] = state
+        manager.calls.clear()
+        act()
+        return [call[0] for call in manager.calls]
+
+    thaw = ["thaw"] if state == "frozen" else []
+    assert calls_of(lambda: systemd.queue_job("StopUnit", unit)) == [*thaw, "StopUnit"]
+    assert calls_of(lambda: systemd.queue_job("RestartUnit", unit)) == [*thaw, "RestartUnit"]
+    assert calls_of(lambda: systemd.kill(unit, 9)) == [*thaw, "kill"]
+    assert calls_of(lambda: systemd.queue_job("StartUnit", unit)) == ["StartUnit"]
 
 
-def test_a_frozen_slice_is_left_to_its_owner() -> None:
-    systemd = Freezer("frozen-by-parent")
+def test_a_frozen_slice_is_left_to_its_owner(monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = FakeManager()
+    unit = manager.add(options(), FreezerState="frozen-by-parent", Slice="dora.slice")
+    fake_systemd(monkeypatch, manager)
     with pytest.raises(DoraSystemdError, match="slice that contains it is frozen") as caught:
-        systemd.queue_job("StopUnit", "x.service")
+        bus.Bus(SYSTEM).queue_job("StopUnit", unit)
     assert caught.value.hint == "run: systemctl --system thaw dora.slice"
-    assert not systemd.called
+    assert not manager.calls
 
 
 def test_other_errors_pass() -> None:
@@ -211,28 +213,34 @@ def test_private_socket_where_a_user_has_no_bus(tmp_path: Path) -> None:
     assert connection._address(scope) == str(tmp_path / "bus")
 
 
+class Working(FakeManager):
+    """A manager that has another job for its unit each time that it is asked."""
+
+    def __init__(self, *jobs: int) -> None:
+        super().__init__()
+        self.jobs = list(jobs)
+
+    def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+        return {**super().read(unit, names), "Job": [self.jobs.pop(0), "/"]}
+
+
 @pytest.mark.parametrize("now", [0, 8])
-def test_a_job_that_ends_while_it_is_asked_waits_for_nothing(now: int) -> None:
+def test_a_job_that_ends_while_it_is_asked_waits_for_nothing(
+    now: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The error has the class of ENOENT then, and no name."""
-    jobs = iter([7, now])
-
-    class OneJob(bus.Bus):
-        def _read_one(self, *_: Any) -> Any:
-            return next(jobs), "/"
-
-        def _call(self, *_: Any, **_named: Any) -> Any:
-            raise DoraSystemdError("cannot read the job: Job 7 does not exist.")
-
-        def __init__(self) -> None:
-            pass
-
-    assert OneJob().awaited("dora-robot.service") == []
+    manager = Working(7, now)
+    systemd = fake_systemd(monkeypatch, manager)
+    systemd.refused["GetJobBefore"] = DBusBaseError(message="Job 7 does not exist.")
+    assert bus.Bus(SYSTEM).awaited("dora-robot.service") == []
+    assert not manager.jobs
 
 
-class DBusBaseError(Exception):
-    """The class of all errors of pystemd."""
-
-    errno = -110
+def test_a_job_that_systemd_tells_nothing_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    systemd = fake_systemd(monkeypatch, Working(7, 7))
+    systemd.refused["GetJobBefore"] = DBusBaseError(message="Job 7 does not exist.")
+    with pytest.raises(DoraSystemdError, match=r"read the job of dora-robot\.service: Job 7"):
+        bus.Bus(SYSTEM).awaited("dora-robot.service")
 
 
 def test_a_systemd_that_accepts_and_does_not_answer_costs_no_descriptor(

@@ -2,13 +2,13 @@
 
 import asyncio
 import json
-from typing import Any
+from typing import Any, Self
 
 from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.machines.wire import Message, format_message
 
 
-class FakeWriter(asyncio.StreamWriter):
+class FakeWriter:
     """Keeps what is written. An abort is the end for the reader too. unsent: as the kernel has."""
 
     def __init__(self, reader: asyncio.StreamReader) -> None:
@@ -16,10 +16,10 @@ class FakeWriter(asyncio.StreamWriter):
         self.is_closed = False
 
     @property
-    def transport(self) -> Any:
+    def transport(self) -> Self:
         return self
 
-    def write(self, data: bytes) -> None:  # type: ignore[override]
+    def write(self, data: bytes) -> None:
         asyncio.get_running_loop()  # raises in a thread, where a real one would break
         self.data += data
 
@@ -38,9 +38,6 @@ class FakeWriter(asyncio.StreamWriter):
 
     def get_write_buffer_size(self) -> int:
         return self.unsent
-
-    def __del__(self, *_: Any) -> None:
-        """There is nothing to close."""
 
 
 class FakeEnds:

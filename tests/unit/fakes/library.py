@@ -43,13 +43,15 @@ class Message:
 class FakeSystemd:
     """is_slow: jobs end with the first kill, or finish(). lives: InvocationID, one by one.
 
-    refuses: an error that it answers each call with. timeouts: for an answer, of each connection.
+    refuses: an error that it answers each call with. refused: the same by method. timeouts: for an
+    answer, of each connection.
     """
 
     def __init__(self, manager: FakeManager) -> None:
         self.manager = manager
         self.is_slow = False
         self.refuses: Exception | None = None
+        self.refused: dict[str, Exception] = {}
         self.timeouts: list[str] = []
         self.lives: list[Callable[[], str]] = []
         self.connections: list[Connection] = []
@@ -62,8 +64,8 @@ class FakeSystemd:
             return self.connections[-1]
 
     def call(self, path: bytes, method: str, words: list[str]) -> Any:
-        if self.refuses:
-            raise self.refuses
+        if error := self.refused.get(method, self.refuses):
+            raise error
         with self._lock:
             if method in JOBS:
                 return self._job(method, words[0])
@@ -78,6 +80,8 @@ class FakeSystemd:
             return [[one.unit, one.description, *one[1:4], "", "/", 0, one.job] for one in found]
         if method == "Get":
             return self._get(path.rpartition(b"/")[2].decode(), words[1])
+        if method == "ThawUnit":
+            self.manager.thaw(words[0])
         if method == "ResetFailedUnit":
             self.manager.reset_failed(words[0])
         if method == "RefUnit":

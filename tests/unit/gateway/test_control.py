@@ -5,13 +5,16 @@ import inspect
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from websockets.client import ClientProtocol
+from websockets.uri import parse_uri
 
 from dora_systemd.adapters.dora.control import Connection
+from dora_systemd.adapters.dora.websocket import WebSocket
 from dora_systemd.decisions.gateway.answers import (
     bare_descriptor,
     dataflow_list,
@@ -40,6 +43,7 @@ from dora_systemd.gateway.control.serve import HANDLERS, REFUSED, serve_control
 from dora_systemd.gateway.control.start import find_file
 from dora_systemd.gateway.control.talk import Talk
 from dora_systemd.scope import Scope
+from tests.unit.fakes.ends import FakeWriter
 from tests.unit.fakes.socket import FakeSocket
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
@@ -407,23 +411,16 @@ def test_a_conversation() -> None:
     assert sent[6]["result"]["CliAndDefaultDaemonIps"]["cli"] == "127.0.0.1"
 
 
-class FakeTopic(Connection):
-    """A connection to a dataflow that delivers nothing."""
-
-    def __init__(self) -> None:
-        self.is_closed = False
-
-    def close(self) -> None:
-        self.is_closed = True
-
-
 def test_a_client_that_leaves_before_its_reply_keeps_no_connection() -> None:
     async def play() -> None:
-        mine, topic = Talk(FakeSocket([]), Scope(True, 1000)), FakeTopic()
+        mine, reader = Talk(FakeSocket([]), Scope(True, 1000)), asyncio.StreamReader()
+        writer = FakeWriter(reader)
+        protocol = ClientProtocol(parse_uri("ws://127.0.0.1/"))
+        socket = WebSocket(protocol, reader, cast(asyncio.StreamWriter, writer))
         mine.after_reply(asyncio.sleep(0))
-        mine.topics["id"] = topic
+        mine.topics["id"] = Connection(socket)
         await mine.end()
-        assert topic.is_closed
+        assert writer.is_closed
         late = asyncio.sleep(0)
         with pytest.raises(DoraSystemdError, match="has disconnected"):
             mine.after_reply(late)

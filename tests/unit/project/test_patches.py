@@ -26,20 +26,20 @@ METHOD = "method-assign"
 def find_patches(text: str) -> Iterator[int]:
     """The lines of a module that replace something of ours."""
     tree = ast.parse(text)
-    ours = _imported(tree)
+    ours = imported_from_ours(tree)
     ours |= _looped(tree, ours)
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and _called(node.func) in PATCHES and node.args:
-            if _root(node.args[0]) in ours or _is_path_of_ours(node.args[0]):
+            if root_of(node.args[0]) in ours or _is_path_of_ours(node.args[0]):
                 yield node.lineno
         elif isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            if any(_root(one) in ours for one in targets if not isinstance(one, ast.Name)):
+            if any(root_of(one) in ours for one in targets if not isinstance(one, ast.Name)):
                 yield node.lineno
     yield from (n for n, line in enumerate(text.splitlines(), 1) if METHOD in line)
 
 
-def _imported(tree: ast.Module) -> set[str]:
+def imported_from_ours(tree: ast.Module) -> set[str]:
     """The names that a module imports from ours."""
     found: set[str] = set()
     for node in ast.walk(tree):
@@ -58,7 +58,7 @@ def _looped(tree: ast.Module, ours: set[str]) -> set[str]:
         loop.target.id
         for loop in loops
         if isinstance(loop.target, ast.Name) and isinstance(loop.iter, ast.Tuple | ast.List)
-        if any(_root(one) in ours for one in loop.iter.elts)
+        if any(root_of(one) in ours for one in loop.iter.elts)
     }
 
 
@@ -74,7 +74,7 @@ def _called(function: ast.expr) -> str:
     return function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
 
 
-def _root(node: ast.expr) -> str:
+def root_of(node: ast.expr) -> str:
     """The first name in `a.b.c` or `a.b["c"]`."""
     while isinstance(node, ast.Attribute | ast.Subscript):
         node = node.value

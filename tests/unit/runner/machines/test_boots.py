@@ -4,11 +4,8 @@ import json
 import os
 import socket
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,9 +15,9 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.machines.wire import Beat, Forwards, Part, format_message
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import Daemon
 from dora_systemd.runner.machines.head_boot import GREETED, greeting
-from dora_systemd.runner.machines.member_boot import MemberBoot, received
+from dora_systemd.runner.machines.member_boot import received
+from tests.unit.fakes.boots import QuietBoot, standard_input
 from tests.unit.fakes.manager import UUID
 
 PORTS = Forwards(61000, {"head": 61001, "gpu": 61002})
@@ -75,38 +72,9 @@ def test_nobody_else_gets_ports(line: bytes) -> None:
     assert greeting(line, ("gpu",), PORTS) == (b"", line)
 
 
-@contextmanager
-def standard_input(*said: bytes, is_given: bool = True) -> Iterator[None]:
-    """With a connection in it, in which somebody has said something."""
-    old = os.dup(0)
-    own, theirs = socket.socketpair()
-    giving, stdin = socket.socketpair()
-    own.sendall(b"".join(said))
-    if is_given:
-        socket.send_fds(giving, [b"\n"], [theirs.fileno()])
-    os.dup2(stdin.fileno(), 0)
-    try:
-        yield
-    finally:
-        os.dup2(old, 0)
-        os.close(old)
-        for one in (own, theirs, giving, stdin):
-            one.close()
-
-
-class Quiet(MemberBoot):
-    """Starts nothing."""
-
-    started: Mapping[str, Any] = {}
-
-    def _spawn_daemon(self) -> Daemon:
-        self.started = {"port": self._port, **self._environment}
-        raise OSError
-
-
 def test_a_member_is_told_by_its_standard_input(tmp_path: Path) -> None:
     with standard_input(format_message(PART), format_message(Beat())):
-        boot = Quiet(OPTIONS, CellPaths(tmp_path), tmp_path, {})
+        boot = QuietBoot(OPTIONS, CellPaths(tmp_path), tmp_path, {})
         assert str(Path("/proc/self/fd/0").readlink()) == os.devnull
     assert boot.part == PART
     assert boot.rest == format_message(Beat())
@@ -120,7 +88,7 @@ def test_a_member_is_told_by_its_standard_input(tmp_path: Path) -> None:
 @pytest.mark.parametrize("said", [b"", b"hello\n", format_message(replace(PART, machine="arm"))])
 def test_a_member_that_is_told_something_else(tmp_path: Path, said: bytes) -> None:
     with standard_input(said, b"\n"), pytest.raises(DoraSystemdError):
-        Quiet(OPTIONS, CellPaths(tmp_path), tmp_path, {})
+        QuietBoot(OPTIONS, CellPaths(tmp_path), tmp_path, {})
 
 
 def test_a_member_that_nobody_has_started() -> None:

@@ -26,9 +26,9 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.machines.engine import MemberEngine
 from dora_systemd.runner.machines.member import Member
-from dora_systemd.runner.machines.member_boot import MemberBoot
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, find_pids
 from dora_systemd.values import SECOND
+from tests.unit.fakes.boots import told_boot
 from tests.unit.fakes.dialogue import Heard
 from tests.unit.fakes.ends import FakeEnds
 from tests.unit.fakes.loop import live
@@ -45,13 +45,6 @@ PART = wire.Part(
 )
 
 
-class FakeBoot(MemberBoot):
-    """The head has said its part."""
-
-    def __init__(self) -> None:
-        self.part = PART
-
-
 class FakeEngine(MemberEngine):
     """is_cut_off: its daemon was killed."""
 
@@ -64,7 +57,7 @@ class FakeEngine(MemberEngine):
 class Bench:
     def __init__(self, root: Path, state: State) -> None:
         paths = CellPaths(root)
-        self.boot = FakeBoot()
+        self.boot = told_boot(OPTIONS, root, PART)
         self.comes = asyncio.get_running_loop().create_future()
         self.member = Member(OPTIONS, Life("uuid"), self.boot, self.take_over)
         self.member._version = "1.1.4"
@@ -376,8 +369,9 @@ def test_the_head_hears_why_a_node_is_ended(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
-def test_only_the_head_decides_what_is_essential() -> None:
+def test_only_the_head_decides_what_is_essential(tmp_path: Path) -> None:
     """Else the end of the part would come first, and look like the loss of its machine."""
     rights = (NodeRights("mid", essential=True), NodeRights("mid", essential=True, nice=5))
-    member = Member(OPTIONS._replace(node_rights=rights), Life("uuid"), FakeBoot())
+    options = OPTIONS._replace(node_rights=rights)
+    member = Member(options, Life("uuid"), told_boot(options, tmp_path, PART))
     assert member.options.node_rights == (NodeRights("mid", nice=5),)
