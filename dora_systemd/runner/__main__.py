@@ -60,11 +60,11 @@ def begin_shared(
     """The same for one of several machines. Raises OSError, DoraSystemdError."""
     boot: EarlyDaemon
     if options.machine:
-        from dora_systemd.runner.machines.member_boot import MemberBoot
+        from dora_systemd.runner.machines.boot import MemberBoot
 
         boot = MemberBoot(options, paths, unit, environment)
     else:
-        from dora_systemd.runner.machines.head_boot import HeadBoot
+        from dora_systemd.runner.machines.boot import HeadBoot
 
         boot = HeadBoot(options, paths, unit, environment)
     from dora_systemd.adapters.dora.check import DoraCheck

@@ -48,14 +48,9 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import SILENCE, Engine
 from dora_systemd.runner.cell.life import Life, is_transient
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.machines.ending import end_nodes
-from dora_systemd.runner.machines.engine import NOISE, HeadEngine
-from dora_systemd.runner.machines.head_boot import HeadBoot
-from dora_systemd.runner.machines.ports import choose_ports
-from dora_systemd.runner.machines.programs import read_digests
-from dora_systemd.runner.machines.reach import unreached
-from dora_systemd.runner.machines.roster import Roster
-from dora_systemd.runner.machines.shared import Shared
+from dora_systemd.runner.machines.boot import HeadBoot, choose_ports
+from dora_systemd.runner.machines.roster import Roster, find_unreached
+from dora_systemd.runner.machines.shared import NOISE, HeadEngine, Shared, end_nodes, read_digests
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
@@ -116,7 +111,7 @@ class Head(Shared):
         """Note what the members have to compare."""
         self.check(prepared.dataflow)
         content = Path(self.options.dataflow).read_bytes()
-        # Who has written a unit file may not be there when a boot starts it.
+        # At boot nobody is present to repair a missing machine.
         is_by_hand = is_transient(self.options.name, paths.is_of_user)
         is_awaited = self.this_life.is_first and is_by_hand and not self.this_life.up_us
         self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version(), is_awaited)
@@ -165,7 +160,7 @@ class Head(Shared):
     def dialogue(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> Dialogue:
-        """What also waits for the members, and does without dora if one is lost."""
+        """Dialogue of a head: waits for all members, and ends nodes without dora if one is lost."""
         assert isinstance(dora, HeadEngine)
         pipes.left_out = NOISE
         self.roster.push, self.roster.refresh = pump.push, pump.refresh
@@ -217,7 +212,7 @@ class HeadDialogue(Dialogue):
         }
 
     async def _gather(self) -> None:
-        """Wait for all members; not without end if somebody waits for this start."""
+        """Wait for all members; if doractl waits for the start, at most for start_timeout."""
         given = self._options.start_timeout
         most = (FIRST_PATIENCE if given == INFINITY else given) / SECOND
         try:
@@ -239,7 +234,7 @@ class HeadDialogue(Dialogue):
             self._roster.changed.clear()
             self._show_awaited()
             if not self._roster.missing() and await self._has_each():
-                self._unreached = await unreached(self._roster.endpoints())
+                self._unreached = await find_unreached(self._roster.endpoints())
                 if not self._unreached:
                     return
             with contextlib.suppress(TimeoutError):

@@ -32,17 +32,15 @@ Hear = Callable[[Message], None]
 
 
 class Lines:
-    """A talk. silent: beats since the last line came. on_beat: called before each own beat.
-
-    is_broken: it has ended because of what the other side has said.
-    """
+    """One connection between head and member. on_beat: called before each own heartbeat."""
 
     def __init__(self, ends: Ends, on_beat: Callable[[], None] = lambda: None) -> None:
         self._reader, self._writer = ends
         self._on_beat = on_beat
         self._why = "the connection has ended"
-        self.is_broken = False
-        self.silent = self._heard = self._bytes = 0
+        self.is_broken = False  # the connection has ended because of what the other side sent
+        self.silent = 0  # own heartbeats since the last received line
+        self._heard = self._bytes = 0
 
     def send(self, message: Message) -> None:
         """Send a message, unless the talk has ended."""

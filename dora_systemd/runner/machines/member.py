@@ -44,12 +44,16 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.machines.engine import NOISE, MemberEngine
+from dora_systemd.runner.machines.boot import MemberBoot, no_head
 from dora_systemd.runner.machines.lines import Lines
-from dora_systemd.runner.machines.member_boot import MemberBoot, no_head
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
-from dora_systemd.runner.machines.programs import own_digests, read_digests
-from dora_systemd.runner.machines.shared import Shared
+from dora_systemd.runner.machines.shared import (
+    NOISE,
+    MemberEngine,
+    Shared,
+    own_digests,
+    read_digests,
+)
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import INFINITY

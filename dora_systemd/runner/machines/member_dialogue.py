@@ -16,8 +16,7 @@ from dora_systemd.decisions.machines.own import is_here
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.machines.ending import end_nodes
-from dora_systemd.runner.machines.engine import MemberEngine
+from dora_systemd.runner.machines.shared import MemberEngine, end_nodes
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 

@@ -18,13 +18,13 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.machines.address import endpoint
 from dora_systemd.decisions.machines.awaited import NOT_CONNECTED, NOT_JOINED, USUAL
 from dora_systemd.decisions.machines.usage import merged
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.runner.cell.pump import now_us
-from dora_systemd.runner.machines.head_boot import GREETED, forwards
+from dora_systemd.runner.machines.boot import GREETED, forwards
 from dora_systemd.runner.machines.lines import Lines
-from dora_systemd.runner.machines.reach import Endpoints
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import quoted
 
@@ -39,29 +39,28 @@ _LONGEST = 300
 _LOOK_SECONDS = 0.02
 _CHECK_SECONDS = 30.0
 """Time for a member to check its part: its dora may have to read the descriptor."""
+_CONNECT_SECONDS = 3.0
+
+Endpoints = Mapping[str, tuple[str, int]]
+"""Address and port by machine."""
 
 
 class Member:
-    """One member.
-
-    lines: the talk with it, if there is one. work: dora's directory there, "" until it is ready.
-    words: why it is not ready. table: of its nodes. has_left: its part has ended in peace.
-    is_over: it has said that its part ends, and is not ready again in this talk. failed: attempts
-    in a row that came to nothing. checked: its answer to the last Check, None until that comes.
-    """
+    """What the head knows of one member."""
 
     def __init__(self) -> None:
-        self.lines: Lines | None = None
-        self.work = ""
-        self.words = NOT_CONNECTED
-        self.table = CellStatus()
-        self.has_left = self.is_over = False
-        self.failed = 0
-        self.checked: wire.Checked | None = None
+        self.lines: Lines | None = None  # the connection, if there is one
+        self.work = ""  # dora's directory on that machine, "" until the member is ready
+        self.words = NOT_CONNECTED  # why the member is not ready
+        self.table = CellStatus()  # of the member's nodes
+        self.has_left = False  # the member has reported a clean end
+        self.is_over = False  # it has reported an end, and is not ready again in this connection
+        self.failed = 0  # attempts to connect in a row that have failed
+        self.checked: wire.Checked | None = None  # the answer to the last Check, if it has come
 
     @property
     def is_heard(self) -> bool:
-        """Whether it is there now."""
+        """Whether something was received from the member a short time ago."""
         return self.lines is not None and self.lines.silent < _SILENT_BEATS
 
 
@@ -77,24 +76,22 @@ def _refusal(name: str, member: Member) -> DoraSystemdError | None:
 
 
 class Roster:
-    """All members of a dataflow. push: takes the events; it is set before the first talk.
-
-    refresh: writes the table of the head, because that of a member is new. changed: set whenever
-    something is new of a member. lost: the members that were lost in the run before this one.
-    is_awaited: whether a person waits for this start, and can mend what a machine at its boot
-    cannot. on_programs: is told what the nodes of a member run.
-    """
+    """All members of a dataflow, and the connections to them."""
 
     def __init__(self, options: RunnerOptions, ports: wire.Forwards) -> None:
         self._options, self._ports = options, ports
         self._members = {name: Member() for name in members_of(options.placed)}
         self._token = self._digest = self._dora = ""
-        self.changed = asyncio.Event()
-        self.lost: frozenset[str] = frozenset()
+        self.changed = asyncio.Event()  # something is new of a member
+        self.lost: frozenset[str] = frozenset()  # the members lost in the run before this one
+        # Whether a person waits for this start, and can repair what a machine at its boot cannot.
         self.is_awaited = self._is_closed = False
         self._taken = 0
+        # Takes the events; set before the first connection.
         self.push: Callable[[life.Event], None] = lambda _: None
+        # Takes the digests of what the nodes of a member run.
         self.on_programs: Callable[[str, str], None] = lambda _name, _digests: None
+        # Writes the table of the head again, because that of a member is new.
         self.refresh: Callable[[], None] = lambda: None
         self._is_refreshing = False
 
@@ -104,7 +101,7 @@ class Roster:
         return tuple(self._members)
 
     def set_facts(self, digest: str, dora: str, is_awaited: bool) -> None:
-        """Set what members compare: see wire.Part. is_awaited: see Roster."""
+        """Set what members compare: see wire.Part."""
         self._digest, self._dora, self.is_awaited = digest, dora, is_awaited
 
     def close(self) -> None:
@@ -303,7 +300,7 @@ class Roster:
         self.changed.set()
 
     def _unreached(self, name: str, message: wire.Unreached) -> None:
-        """Give up what nobody mends by waiting; else it is one more attempt."""
+        """Fail the start if retrying cannot help; otherwise count a failed attempt."""
         member = self._members[name]
         member.failed += 1
         if not message.tries or (self.is_awaited and member.failed >= message.tries):
@@ -330,3 +327,25 @@ class Roster:
         if was_ready or by:
             self.push(life.MachineLost(now_us(), name, member.words, by, bool(message.failed)))
         self.changed.set()
+
+
+async def find_unreached(endpoints: Endpoints) -> dict[str, str]:
+    """Find the machines whose zenoh cannot be reached, and why: only with `link: direct`.
+
+    dora starts a run that nobody can hear: what keeps daemons apart, such as a firewall, is no
+    error to dora. So the head connects before each run; zenoh logs no connection that ends at once.
+    """
+    found = await asyncio.gather(*(_problem(*one) for one in endpoints.values()))
+    return {name: why for name, why in zip(endpoints, found, strict=True) if why}
+
+
+async def _problem(address: str, port: int) -> str:
+    try:
+        async with asyncio.timeout(_CONNECT_SECONDS):
+            _, writer = await asyncio.open_connection(address, port)
+        writer.close()
+    except TimeoutError:
+        return f"cannot connect to {endpoint(address, port)}: timed out"
+    except OSError as error:
+        return f"cannot connect to {endpoint(address, port)}: {words_of(error)}"
+    return ""

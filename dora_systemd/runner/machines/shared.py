@@ -1,15 +1,38 @@
 """What head and members have in common: some nodes of their dataflow run elsewhere."""
 
+import asyncio
+import contextlib
+import hashlib
+import os
+import signal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.dora import engine
+from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.machines.own import own_options
+from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.machines.own import is_here, own_options
 from dora_systemd.decisions.machines.part import own_dataflow
+from dora_systemd.decisions.machines.programs import MOST_FILES
+from dora_systemd.decisions.machines.wire import Forwards, Part
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
+from dora_systemd.runner.cell.boot import EarlyDaemon
+from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.role import Alone
+from dora_systemd.runner.machines.boot import head_arguments, member_arguments, shared_environment
+from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.runner.reload.sources import Sources
+from dora_systemd.trust.eyes import read_regular
 from dora_systemd.values import INFINITY
 
 
 class Shared(Alone):
-    """One of several machines."""
+    """What a cell asks where machines make a difference, on one of several machines."""
 
     @property
     def start_timeout(self) -> int:
@@ -23,3 +46,182 @@ class Shared(Alone):
     def here(self, dataflow: Dataflow) -> Dataflow:
         """The dataflow without other machines' nodes."""
         return own_dataflow(self.options, dataflow)
+
+
+ASK_SECONDS = 5.0
+"""A coordinator that waits for a machine answers nobody for half a minute."""
+NOISE = (
+    b"Gossip is disabled: cannot de-duplicate",
+    b"Scouting delay elapsed before start conditions are met",
+    b"peer daemon disconnected",
+    b"WS coordinator connection error",
+)
+"""Warnings about what zenoh-machines.json5 wants, and about machines: we tell more of those."""
+
+
+class SharedEngine(Engine):
+    """The dora of a head or a member. machine: the name of its daemon, "" on the head."""
+
+    machine = ""
+
+    def __init__(
+        self,
+        dora: str,
+        paths: CellPaths,
+        environment: Mapping[str, str],
+        addresses: Sequence[str],
+        boot: EarlyDaemon | None = None,
+    ) -> None:
+        super().__init__(dora, paths, shared_environment(environment, addresses), boot)
+        self._addresses = addresses
+
+    async def heartbeats(self) -> list[tuple[str, int]]:
+        """The machine of each daemon that is connected, and µs since it was heard.
+
+        Raises DoraSystemdError.
+        """
+        reply = await self.ask_soon(protocol.CONNECTED_DAEMONS)
+        return protocol.parse_heartbeats(reply)
+
+    async def ask_soon(self, params: protocol.Params) -> protocol.Reply:
+        """Send a request. Raises DoraSystemdError, also if ASK_SECONDS are not enough."""
+        try:
+            async with asyncio.timeout(ASK_SECONDS):
+                return await self.ask(params)
+        except TimeoutError as error:
+            raise DoraSystemdError("the dora coordinator does not answer") from error
+
+    async def is_joined(self) -> bool:
+        """Whether the daemon of this machine has registered."""
+        return any(machine == self.machine for machine, _ in await self.heartbeats())
+
+
+class HeadEngine(SharedEngine):
+    """Coordinator and daemon of the head, on ports that all machines know."""
+
+    def __init__(
+        self,
+        dora: str,
+        paths: CellPaths,
+        environment: Mapping[str, str],
+        addresses: Sequence[str],
+        ports: Forwards,
+        on_access: Callable[[str], None],
+        boot: EarlyDaemon | None = None,
+    ) -> None:
+        super().__init__(dora, paths, environment, addresses, boot)
+        self._ports, self._on_access = ports, on_access
+
+    def _spawn_coordinator(self) -> engine.Child:
+        return start_coordinator(
+            self._dora, self._paths, self._environment, self._ports.coordinator
+        )
+
+    def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
+        more = head_arguments(self._ports, environment, self._addresses)
+        return start_daemon(self._dora, self._paths, self._port, environment, more=more)
+
+    def set_port(self, port: int) -> None:
+        """Set the port of the coordinator, and tell the members."""
+        super().set_port(port)
+        self._on_access(self._token)
+
+
+class MemberEngine(SharedEngine):
+    """The daemon of a member; its coordinator is on the head."""
+
+    _part: Part
+
+    def __init__(
+        self,
+        dora: str,
+        paths: CellPaths,
+        environment: Mapping[str, str],
+        addresses: Sequence[str],
+        machine: str,
+        boot: EarlyDaemon | None = None,
+    ) -> None:
+        super().__init__(dora, paths, environment, addresses, boot)
+        self.machine = machine
+
+    def set_part(self, part: Part) -> None:
+        """Set how to reach the head. That is in memory only."""
+        self._part, self._port, self._token = part, part.coordinator, part.token
+
+    def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
+        more = member_arguments(self._part, environment, self._addresses)
+        return start_daemon(self._dora, self._paths, self._port, environment, self._token, more)
+
+    def cut_off(self) -> None:
+        """Kill the daemon, because its coordinator is gone.
+
+        It would look for one again at the same port of 127.0.0.1, show it the token, and start
+        what it is told to. The link is gone as well, so any user here can listen there.
+        """
+        if daemon := self._children.get("daemon"):
+            daemon.send_signal(signal.SIGKILL)
+
+    def _write_access(self, daemon: Daemon) -> None:
+        """Requests to the coordinator are the head's."""
+
+    async def find_silent(self, seconds: float) -> str:
+        """Nothing: the head sees whether the daemon hangs."""
+        del seconds
+        return ""
+
+
+_MOST_BYTES = 32 << 20
+"""Of one file: a larger one is not compared."""
+
+
+def own_digests(
+    options: RunnerOptions, prepared: Prepared, environment: Mapping[str, str]
+) -> dict[str, str]:
+    """The digests of the programs of this machine's nodes. Raises DoraSystemdError."""
+    by_node = Sources(options, environment).files(prepared)
+    files = {one for node, some in by_node.items() if is_here(options, node) for one in some}
+    root = Path(options.dataflow).parent
+    return read_digests(root, sorted(os.path.relpath(one, root) for one in files))
+
+
+def read_digests(root: Path, paths: Iterable[str]) -> dict[str, str]:
+    """The digests of the regular files among `paths`, which are relative to `root`."""
+    found = {path: _digest(root / path) for path in list(paths)[:MOST_FILES] if path[:2] != ".."}
+    return {path: one for path, one in found.items() if one}
+
+
+def _digest(path: Path) -> str:
+    try:
+        data = read_regular(path, _MOST_BYTES + 1)
+    except (OSError, ValueError):
+        return ""
+    return hashlib.sha256(data).hexdigest() if len(data) <= _MOST_BYTES else ""
+
+
+_LOOK_SECONDS = 0.05
+
+
+async def end_nodes(nodes: Nodes, own: Iterable[str], seconds: float) -> None:
+    """SIGTERM for every process of the nodes `own`; SIGKILL for what is left after `seconds`."""
+    unit, _ = nodes.places
+    own = list(own)
+    nodes.let_go()
+    # Dora takes each end for a crash. A launcher that it starts now leaves at its gate.
+    nodes.gates.make(own)
+    nodes.gates.dismiss()
+    groups = cgroup.node_groups(unit)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await asyncio.gather(*(_end(groups[node]) for node in own if node in groups))
+    nodes.kill()
+
+
+async def _end(group: Path) -> None:
+    """Return when no process of the group is left. One that comes meanwhile gets the signal too."""
+    told: set[int] = set()
+    while pids := {*cgroup.pids(group)}:
+        for pid in pids - told:
+            with contextlib.suppress(OSError):
+                os.kill(pid, signal.SIGTERM)
+        told |= pids
+        await asyncio.sleep(_LOOK_SECONDS)

@@ -11,7 +11,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.machines.wire import Part, format_message
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon
-from dora_systemd.runner.machines.member_boot import MemberBoot
+from dora_systemd.runner.machines.boot import MemberBoot
 
 
 @contextmanager

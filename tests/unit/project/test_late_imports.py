@@ -145,7 +145,7 @@ LATE = {
     "the coordinator boots while the rest of the runner is imported": {
         "runner.__main__": {
             *("adapters.dora.check", "runner.cell.boot", "runner.main"),
-            *("runner.machines.head_boot", "runner.machines.member_boot"),
+            *("runner.machines.boot", "runner.machines.boot"),
         },
         "runner.cell.begin": {"adapters.dora.command", "runner.nodes.rights"},
         "runner.cell.pause": {

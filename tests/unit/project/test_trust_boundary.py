@@ -80,9 +80,9 @@ _TABLE = {
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
         adapters.runner_socket.address
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
-        runner.cell.life runner.machines.member_boot
+        runner.cell.life runner.machines.boot
         adapters.host.presence runner.asked.hand runner.needs.needs runner.nodes.gate
-        runner.cell.engine runner.cell.pump runner.machines.head runner.machines.reach
+        runner.cell.engine runner.cell.pump runner.machines.head runner.machines.roster
         runner.main runner.nodes.nodes
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,

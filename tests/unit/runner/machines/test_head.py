@@ -22,9 +22,9 @@ from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.life import Life
-from dora_systemd.runner.machines.engine import HeadEngine
 from dora_systemd.runner.machines.head import HeadDialogue
 from dora_systemd.runner.machines.roster import Roster
+from dora_systemd.runner.machines.shared import HeadEngine
 from dora_systemd.values import SECOND
 from tests.unit.fakes.dialogue import Heard
 from tests.unit.fakes.ends import FakeEnds

@@ -1,4 +1,4 @@
-"""What head and member do before they import the rest of the runner."""
+"""What head and member do before they import the rest of the runner, and where daemons listen."""
 
 import json
 import os
@@ -15,8 +15,14 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.machines.wire import Beat, Forwards, Part, format_message
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.machines.head_boot import GREETED, greeting
-from dora_systemd.runner.machines.member_boot import received
+from dora_systemd.runner.machines.boot import (
+    GREETED,
+    choose_ports,
+    greeting,
+    head_arguments,
+    received,
+)
+from dora_systemd.runner.machines.shared import SharedEngine
 from tests.unit.fakes.boots import QuietBoot, standard_input
 from tests.unit.fakes.manager import UUID
 
@@ -103,3 +109,31 @@ def test_a_member_that_nobody_has_started() -> None:
         finally:
             os.dup2(old, 0)
             os.close(old)
+
+
+@pytest.mark.parametrize(("addresses", "timeout"), [((), "0"), (("10.99.0.1", "10.99.0.2"), None)])
+def test_nodes_dial_each_other_only_without_ssh(
+    addresses: tuple[str, ...], timeout: str | None, tmp_path: Path
+) -> None:
+    engine = SharedEngine("/bin/dora", CellPaths(tmp_path), {}, addresses)
+    found = engine._environment.get("DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS")
+    assert found == timeout
+    (_, listen, *_) = head_arguments(PORTS, {}, addresses)
+    assert listen == f"{addresses[0] if addresses else '127.0.0.1'}:61001"
+
+
+def test_the_arguments_of_a_daemon() -> None:
+    words = head_arguments(PORTS, {}, ["fd00::1"])
+    assert words[:3] == ("--zenoh-listen", "[fd00::1]:61001", "--zenoh-config-overlay")
+    assert head_arguments(PORTS, {"ZENOH_CONFIG": "/x"}, ()) == (
+        "--zenoh-listen",
+        "127.0.0.1:61001",
+    )
+
+
+def test_a_port_has_to_be_free_on_the_own_address_too() -> None:
+    with socket.create_server(("127.0.0.3", 0)) as one:
+        taken = one.getsockname()[1]
+        some = range(taken, taken + 40)
+        found = choose_ports(("gpu",), ("127.0.0.3", "127.0.0.4"), some)
+        assert taken not in {found.coordinator, *found.zenoh.values()}

@@ -1,0 +1,206 @@
+"""What head and member do before they import the rest of the runner, and the ports for it.
+
+The links of a head wait for its ports, and the daemon of a member joins the head meanwhile.
+
+`doractl member` has made a connection for its relay, and has said in it what to run. Its end for
+the runner comes by standard input. It is not standard input itself: systemd keeps a copy of that
+as long as the unit has any process, and the head has to know at once that this one has ended.
+Imports only what loads quickly. addresses below: of the options; the daemon of a machine listens on
+the first one.
+"""
+
+import json
+import os
+import socket
+import struct
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from errno import EADDRINUSE
+from pathlib import Path
+
+from dora_systemd.adapters.host.addresses import listen_error, port_error
+from dora_systemd.adapters.runner_socket.door import Door
+from dora_systemd.decisions.cell.machines import HEAD, members_of
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.machines.address import LOOPBACK, endpoint
+from dora_systemd.decisions.machines.own import own_options
+from dora_systemd.decisions.machines.wire import (
+    MAX_LINE,
+    PORT_RANGE,
+    Forwards,
+    Part,
+    expect,
+    format_message,
+    parse_message,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
+from dora_systemd.runner.cell.boot import Boot, EarlyDaemon
+
+
+def choose_ports(
+    members: Sequence[str], addresses: Sequence[str] = (), ports: Sequence[int] = PORT_RANGE
+) -> Forwards:
+    """Ports that are free here, other ones each time. Raises DoraSystemdError if there are none.
+
+    addresses: of the options; the daemon here listens on the first one.
+    """
+    begin = int.from_bytes(os.urandom(4)) % len(ports)
+    turned = (*ports[begin:], *ports[:begin])
+    own = addresses[:1]
+    free = (
+        port
+        for port in turned
+        if not port_error(port) and not any(listen_error(one, port) == EADDRINUSE for one in own)
+    )
+    try:
+        return Forwards(next(free), {one: next(free) for one in (HEAD, *members)})
+    except StopIteration:
+        message = f"cannot find free ports from {ports[0]} to {ports[-1]}"
+        raise DoraSystemdError(message, "see: ss -ltn") from None
+
+
+_ZENOH = Path(__file__).parents[2] / "zenoh-machines.json5"
+_NO_DIRECT = {"DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS": "0"}
+"""Where ssh carries the messages, nodes of different machines do not dial each other: the addresses
+would be those of 127.0.0.1. So dora must not wait for them either; it would for 1.5 s."""
+_OVERLAYS = ("ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY")
+"""Variables by which a user sets the same: dora refuses both."""
+
+
+def shared_environment(environment: Mapping[str, str], addresses: Sequence[str]) -> dict[str, str]:
+    """The environment of dora's processes."""
+    return {**environment, **({} if addresses else _NO_DIRECT)}
+
+
+def head_arguments(
+    ports: Forwards, environment: Mapping[str, str], addresses: Sequence[str]
+) -> tuple[str, ...]:
+    """What the daemon of the head needs to meet those of other machines."""
+    return _arguments(ports.zenoh[HEAD], environment, addresses)
+
+
+def member_arguments(
+    part: Part, environment: Mapping[str, str], addresses: Sequence[str]
+) -> tuple[str, ...]:
+    """The same for the daemon of a member, which also needs its name."""
+    return ("--machine-id", part.machine, *_arguments(part.zenoh, environment, addresses))
+
+
+def _arguments(
+    port: int, environment: Mapping[str, str], addresses: Sequence[str]
+) -> tuple[str, ...]:
+    has_own = any(name in environment for name in _OVERLAYS)
+    overlay = () if has_own else ("--zenoh-config-overlay", str(_ZENOH))
+    return ("--zenoh-listen", endpoint([*addresses, LOOPBACK][0], port), *overlay)
+
+
+GREETED = "greeted"
+"""A key of a request for a session that has got its ports already."""
+
+
+class HeadBoot(Boot):
+    """The dora of a head, on ports that all machines know. door: tells them the links."""
+
+    def __init__(
+        self, options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
+    ) -> None:
+        members = members_of(options.placed)
+        self._addresses = options.addresses
+        self.ports = choose_ports(members, options.addresses)
+        told = forwards(options, self.ports)
+        self.door = Door(paths.socket, lambda line: greeting(line, members, told))
+        own = shared_environment(environment, options.addresses)
+        try:
+            coordinator = start_coordinator(options.dora, paths, own, self.ports.coordinator)
+        except (OSError, DoraSystemdError):
+            self.door.close()
+            raise
+        super().__init__(coordinator, options, paths, unit, own)
+
+    def _spawn_daemon(self) -> Daemon:
+        more = head_arguments(self.ports, self._environment, self._addresses)
+        return start_daemon(self._dora, self._paths, self._port, self._environment, more=more)
+
+
+def forwards(options: RunnerOptions, ports: Forwards) -> Forwards:
+    """What a link is told. Without ssh on the way, zenoh's ports are those of other addresses."""
+    return replace(ports, zenoh={}) if options.addresses else ports
+
+
+def greeting(line: bytes, members: tuple[str, ...], ports: Forwards) -> tuple[bytes, bytes]:
+    """The ports for a link, and its request without another wish for them; see Greet."""
+    try:
+        request = json.loads(line)
+        is_link = request.get("verb") == "link" and request.get("machine") in members
+    except (ValueError, AttributeError, TypeError, RecursionError):
+        is_link = False
+    if not is_link:
+        return b"", line
+    return format_message(ports), json.dumps({**request, GREETED: True}).encode()
+
+
+_FD = struct.Struct("i")
+
+
+class MemberBoot(EarlyDaemon):
+    """The daemon of a member. part: what its head has said. rest: what it has said since.
+
+    Raises OSError, and DoraSystemdError (USAGE) if there is no head.
+    """
+
+    def __init__(
+        self, options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
+    ) -> None:
+        self.connection = received()
+        with ExitStack() as undo:
+            undo.callback(self.connection.close)
+            line, _, self.rest = _said(self.connection).partition(b"\n")
+            self.part = expect(parse_message(line), Part)
+            if (self.part.name, self.part.machine) != (options.name, options.machine):
+                raise no_head()
+            undo.pop_all()
+        self._addresses = options.addresses
+        own = shared_environment(environment, options.addresses)
+        super().__init__(own_options(options), paths, unit, own)
+
+    def _find_port(self) -> int:
+        return self.part.coordinator
+
+    def _spawn_daemon(self) -> Daemon:
+        more = member_arguments(self.part, self._environment, self._addresses)
+        given = (self._dora, self._paths, self._port, self._environment)
+        return start_daemon(*given, self.part.token, more)
+
+
+def _said(connection: socket.socket) -> bytes:
+    """What the head has said before this process began; b"" if nothing."""
+    with suppress(BlockingIOError):
+        return connection.recv(MAX_LINE, socket.MSG_DONTWAIT)
+    return b""
+
+
+def received() -> socket.socket:
+    """The connection that waits in standard input, which is /dev/null from then on.
+
+    Raises DoraSystemdError (USAGE) if there is none.
+    """
+    with socket.socket(fileno=os.dup(0)) as stdin:
+        nothing = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+        os.dup2(nothing, 0)
+        os.close(nothing)
+        # Not socket.recv_fds(), which leaves out these flags.
+        flags = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
+        _, given, _, _ = stdin.recvmsg(1, socket.CMSG_SPACE(_FD.size), flags)
+    fds = [_FD.unpack(data)[0] for _, kind, data in given if kind == socket.SCM_RIGHTS]
+    if len(fds) != 1:
+        raise no_head()
+    return socket.socket(fileno=fds[0])
+
+
+def no_head() -> DoraSystemdError:
+    """The error of a member that nobody has told what to run."""
+    hint = "doractl start on the head starts the members"
+    return DoraSystemdError("cannot run a member: no head says what to run", hint, ExitCode.USAGE)
