@@ -50,8 +50,8 @@ if ($output eq 'pipe') {
     open STDOUT, '>', "$cell/io/$node.out" or fail(126, "$node.out");
     open STDERR, '>', "$cell/io/$node.err" or fail(126, "$node.err");
 }
-# A node with needs has a gate, see runner/nodes/gate.py: the runner writes words of three bytes when
-# the node may go on, or has to end. Without a word the gate was closed again.
+# A node with needs has a gate, see runner/nodes/launcher_gates.py: the runner writes words of three
+# bytes when the node may go on, or has to end. Without a word the gate was closed again.
 my $gate = "$cell/io/$node.gate";
 while (-p $gate) {
     open my $fifo, '<', $gate or fail(126, "$node.gate");

@@ -21,7 +21,7 @@ from dora_systemd.runner.cell.begin import (
     nodes_environment,
     start_coordinator,
 )
-from dora_systemd.runner.cell.pause import pause
+from dora_systemd.runner.cell.restarts import pause
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck

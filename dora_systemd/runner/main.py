@@ -36,8 +36,6 @@ from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.asked.hand import end_held
-from dora_systemd.runner.asked.requests import NodeRequests
 from dora_systemd.runner.cell.begin import (
     daemon_variables,
     enter_supervisor,
@@ -45,25 +43,27 @@ from dora_systemd.runner.cell.begin import (
     nodes_environment,
 )
 from dora_systemd.runner.cell.boot import EarlyDaemon
-from dora_systemd.runner.cell.clock import StopClock
+from dora_systemd.runner.cell.clock import Keepalive, StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside, say, words
-from dora_systemd.runner.cell.keepalive import Keepalive
-from dora_systemd.runner.cell.life import Life, begin_life, learn_first
-from dora_systemd.runner.cell.pause import find_spent, forget_restarts, hold_back
+from dora_systemd.runner.cell.machine_role import Alone
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.needs.needs import wait_for_needs
-from dora_systemd.runner.nodes.descriptors import wait_eof
-from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
+from dora_systemd.runner.cell.restarts import (
+    Life,
+    begin_life,
+    find_spent,
+    forget_restarts,
+    hold_back,
+    learn_first,
+)
+from dora_systemd.runner.nodes.lost_entries import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.rights import check_first
-from dora_systemd.runner.owes.begin import begin_watch
-from dora_systemd.runner.recheck import Recheck
 from dora_systemd.runner.reload.apply import Run, tell_started
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.swap import Swapper
-from dora_systemd.runner.roles import role_of
+from dora_systemd.runner.requests import NodeRequests, Recheck, end_held
 from dora_systemd.values import INFINITY, SECOND
 
 SAMPLE_SECONDS = 5.0
@@ -149,6 +149,19 @@ class Runs:
         self.nodes = Nodes(self.unit, paths, pipes, self.role.own(options).watchdogs)
         self.beside = Beside(asyncio.get_running_loop())
         self.check = begun[1] if begun else DoraCheck(options, self.environment)
+
+
+def role_of(options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> Alone:
+    """What this machine is in the dataflow of `options`. boot: of the first run."""
+    if not options.placed:
+        return Alone(options, this_life)
+    if options.machine:
+        from dora_systemd.runner.machines.member import Member
+
+        return Member(options, this_life, boot)
+    from dora_systemd.runner.machines.head import Head
+
+    return Head(options, this_life, boot)
 
 
 async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
@@ -238,10 +251,17 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
-        wait_for_needs(run, own, reloader.definition, dialogue.spawn)
+        runs.nodes.gates.make({one.node for one in own.needs})
+        if own.needs:
+            from dora_systemd.runner.needs import wait_for_needs
+
+            wait_for_needs(run, own, reloader.definition, dialogue.spawn)
         dialogue.spawn("end with the last node", end_held(run))
         dialogue.spawn("tell that it has started", tell_started(run, reloader.has_started))
-        begin_watch(run, prepared, dora, dialogue)
+        if prepared.plan.options.owes:
+            from dora_systemd.runner.owes.watch import watch_owes
+
+            dialogue.spawn("watch what nodes owe", watch_owes(run, prepared, dora, dialogue))
         runs.beside.attach(pump.push)
         try:
             await pump.end
@@ -293,7 +313,16 @@ def stop(pump: Pump, clock: StopClock, by: str) -> None:
 
 async def stop_at_eof(pump: Pump, clock: StopClock) -> None:
     """Stop an attached dataflow when its terminal is gone."""
-    await wait_eof(sys.stdin.fileno())
+    loop, fd, is_over = asyncio.get_running_loop(), sys.stdin.fileno(), asyncio.Event()
+
+    def read() -> None:
+        with contextlib.suppress(BlockingIOError):
+            if not os.read(fd, 4096):
+                loop.remove_reader(fd)
+                is_over.set()
+
+    loop.add_reader(fd, read)
+    await is_over.wait()
     stop(pump, clock, "terminal")
 
 

@@ -23,7 +23,7 @@ from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.nodes.losses import LossWatch
+from dora_systemd.runner.nodes.lost_entries import LossWatch
 
 FLOOD = """
 import sys

@@ -28,7 +28,7 @@ MOST_COUNTED = 64
 """Maximum number of restarts that the runner counts. A larger budget is systemd's start limit."""
 _HAND_STARTS = 30
 """Starts in one window that are no automatic restarts. StartLimitBurst= counts them as well, so it
-is that much larger than the budget, which the runner keeps: see runner/cell/pause.py."""
+is that much larger than the budget, which the runner keeps: see runner/cell/restarts.py."""
 _COUNT = re.compile(r"[0-9]{1,9}")
 
 

@@ -177,8 +177,8 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     is_endless = policy.max_restarts == INFINITY
     return common | typed(
         Restart=policy.policy,
-        # The runner waits for the rest of the delay, see runner/cell/pause.py: RestartSteps= would
-        # count restarts forever.
+        # The runner waits for the rest of the delay, see runner/cell/restarts.py: RestartSteps=
+        # would count restarts forever.
         RestartSec=policy.unit_delay,
         StartLimitIntervalSec=0 if is_endless else policy.window,
         StartLimitBurst=1 if is_endless else policy.unit_burst,

@@ -1,10 +1,13 @@
-"""The clock of a stop, which every step at the end asks how long it may take; and lost time."""
+"""Time in a cell: the clock of a stop, lost time, and the messages to the watchdog of systemd."""
 
+import asyncio
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from dora_systemd.adapters.host import notify
 from dora_systemd.decisions.life.stop_budget import runner_timeout
 from dora_systemd.values import INFINITY, SECOND
 
@@ -77,3 +80,44 @@ class StopClock:
             return self.left(max(begin, self._began) + most - self._now())
 
         return left
+
+
+PATIENCE_SECONDS = 120.0
+
+
+class Keepalive:
+    """Tells systemd that the runner is alive.
+
+    seconds: between two messages. patience: seconds that the loop may stand still.
+    """
+
+    def __init__(
+        self,
+        seconds: float,
+        send: Callable[[], None] = notify.send_alive,
+        patience: float = PATIENCE_SECONDS,
+    ) -> None:
+        self._seconds = seconds
+        self._send = send
+        self._patience = patience
+        self._beat = time.monotonic()
+        self._ended = threading.Event()
+
+    async def beat(self) -> None:
+        """Send messages while the loop goes round, without end."""
+        threading.Thread(target=self._run, name="keepalive", daemon=True).start()
+        try:
+            while True:
+                self._beat = time.monotonic()
+                await asyncio.sleep(self._seconds)
+        finally:
+            self._beat = time.monotonic()
+
+    def end(self) -> None:
+        """Send no more messages."""
+        self._ended.set()
+
+    def _run(self) -> None:
+        while not self._ended.wait(self._seconds):
+            if time.monotonic() - self._beat < self._patience:
+                self._send()

@@ -62,7 +62,7 @@ class Dialogue(Tasks):
 
         variables: what the daemon's environment has besides the nodes'.
         """
-        self._watch_signs()
+        self._watch_nodes()
         return {
             Do.START_DAEMON: lambda: self._start_daemon(variables),
             Do.SEND_START: lambda: self._ask(Do.SEND_START, self._send_start(descriptor)),
@@ -75,14 +75,13 @@ class Dialogue(Tasks):
             Do.EXIT: lambda: self._pump.end.set_result(self._pump.cell.exit),
         }
 
-    def _watch_signs(self) -> None:
+    def _watch_nodes(self) -> None:
         """Watch over the nodes that have a watchdog, from the beginning of the run."""
-        if self._nodes.signs.is_used:
-            from dora_systemd.runner.signs.watch import watch_nodes
+        if (sockets := self._nodes.notify_sockets) is not None:
+            from dora_systemd.runner.nodes.watchdog import WatchdogTimers
 
-            signs, is_blocked = self._nodes.signs, self._nodes.is_blocked
-            work = watch_nodes(signs, self._pump, is_blocked, self._options)
-            self.spawn("watch over its nodes", work)
+            timers = WatchdogTimers(sockets, self._pump, self._nodes.is_blocked, self._options)
+            self.spawn("watch over its nodes", timers.run())
 
     def _ask(self, what: Do, work: Coroutine[Any, Any, None]) -> None:
         self.spawn(what.value, work)

@@ -33,7 +33,7 @@ from dora_systemd.decisions.logs.events import END_EVENTS, NODE_END_EVENTS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.failure import failed, say
-from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
@@ -218,7 +218,7 @@ class Pump:
         self._write_table()
 
     def _write_table(self) -> None:
-        own, lines, signs = self._life, self._pipes.line_counts(), self._nodes.signs.table()
+        own, lines, signs = self._life, self._pipes.line_counts(), self._nodes.signs()
         table = cell_status(self.cell, own.uuid, self._samples, lines, signs)
         table = self.amend(table._replace(up_us=own.up_us, is_first=own.is_first))
         try:

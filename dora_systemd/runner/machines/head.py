@@ -46,8 +46,8 @@ from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.clock import Gaps
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import SILENCE, Engine
-from dora_systemd.runner.cell.life import Life, is_transient
 from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.cell.restarts import Life, is_transient
 from dora_systemd.runner.machines.boot import HeadBoot, choose_ports
 from dora_systemd.runner.machines.roster import Roster, find_unreached
 from dora_systemd.runner.machines.shared import NOISE, HeadEngine, Shared, end_nodes, read_digests

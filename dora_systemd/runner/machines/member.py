@@ -42,8 +42,8 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
-from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.machines.boot import MemberBoot, no_head
 from dora_systemd.runner.machines.lines import Lines
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down

@@ -23,7 +23,7 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.engine import Engine
-from dora_systemd.runner.cell.role import Alone
+from dora_systemd.runner.cell.machine_role import Alone
 from dora_systemd.runner.machines.boot import head_arguments, member_arguments, shared_environment
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.reload.sources import Sources

@@ -2,10 +2,12 @@
 
 import asyncio
 import contextlib
+import resource
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.limits import limit_groups
@@ -24,20 +26,18 @@ from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.decisions.signs.watchdogs import NO_WATCHDOGS, Watchdogs
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.nodes.descriptors import raise_file_limit
-from dora_systemd.runner.nodes.gate import Gates
-from dora_systemd.runner.nodes.hold import Hold
-from dora_systemd.runner.nodes.resources import Resources
-from dora_systemd.runner.signs.hook import signs_of
+from dora_systemd.runner.nodes.groups import Hold, Resources
+from dora_systemd.runner.nodes.launcher_gates import Gates
+
+if TYPE_CHECKING:
+    from dora_systemd.decisions.signs.table import Sign
+    from dora_systemd.runner.nodes.watchdog import NotifySockets
 
 _GONE_SECONDS = 0.05
 
 
 class Nodes:
-    """The node groups below `unit`, the cgroup directory of the unit, and the nodes' pipes.
-
-    signs: the notify sockets of those that `watchdogs` gives one.
-    """
+    """The node groups below `unit`, the cgroup directory of the unit, and the nodes' pipes."""
 
     def __init__(
         self, unit: Path, paths: CellPaths, pipes: LogPipes, watchdogs: Watchdogs = NO_WATCHDOGS
@@ -52,7 +52,7 @@ class Nodes:
         self._tails: dict[str, JsonlTail | None] = {}
         self._holds: dict[str, Hold] = {}
         self.resources = Resources(unit)
-        self.signs = signs_of(watchdogs, unit, paths, pipes.write_event)
+        self.notify_sockets = _notify_sockets(watchdogs, unit, paths, pipes) if watchdogs else None
         self.gates = Gates(paths)
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
@@ -86,7 +86,8 @@ class Nodes:
         cgroup.kill_as_one(self._group(node.id))
         if is_launched(node):
             self._launched.add(node.id)
-            self.signs.make(node.id)
+            if self.notify_sockets:
+                self.notify_sockets.make(node.id)
         if not has_launcher(node):
             self._bare.add(node.id)
         if has_pipes(node):
@@ -123,7 +124,8 @@ class Nodes:
         if hold := self._holds.pop(node, None):
             hold.end()
         cgroup.kill_group(self._group(node))
-        self.signs.remove(node)
+        if self.notify_sockets:
+            self.notify_sockets.remove(node)
         if node in self._piped:
             self._pipes.forget(node)
         self._piped.discard(node)
@@ -169,7 +171,8 @@ class Nodes:
             tail.start()
 
     def _watch_backlog(self, node: str, backlog: int) -> None:
-        if hold := self._holds.get(node):  # another one since the node was removed and added
+        # The node may have been removed and added again: then this is a new Hold.
+        if hold := self._holds.get(node):
             hold.look(backlog)
 
     def adopt(self, node: str, pid: int, rights: Sequence[NodeRights] = ()) -> None:
@@ -221,7 +224,12 @@ class Nodes:
     def forget(self, node: str) -> None:
         """The node's process has ended: later lines and signs come from its next process."""
         self._pipes.set_pid(node, 0)
-        self.signs.forget(node)
+        if self.notify_sockets:
+            self.notify_sockets.forget(node)
+
+    def signs(self) -> dict[str, "Sign"]:
+        """What nodes have sent to their notify sockets."""
+        return self.notify_sockets.table() if self.notify_sockets else {}
 
     def is_blocked(self, node: str) -> bool:
         """Whether the node may have to wait, because journald does not take its lines."""
@@ -296,6 +304,25 @@ class Nodes:
             {key: one.cpu_us for key, one in use.items()},
             {key: one.throttling for key, one in use.items() if any(one.throttling)},
         )
+
+
+def _notify_sockets(
+    watchdogs: Watchdogs, unit: Path, paths: CellPaths, pipes: LogPipes
+) -> "NotifySockets":
+    # Imported late: most nodes have no watchdog.
+    from dora_systemd.runner.nodes.watchdog import NotifySockets
+
+    return NotifySockets(watchdogs, unit, paths, pipes.write_event)
+
+
+def raise_file_limit() -> None:
+    """Raise this process's soft limit of open files to the hard one: it needs four for each node.
+
+    Call this after the coordinator and the daemon have started: they should inherit the old limit,
+    and the daemon raises its own.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def _with_descendants(pid: int) -> list[int]:

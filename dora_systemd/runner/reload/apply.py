@@ -18,9 +18,8 @@ from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.decisions.reload.steps import How, Step
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.nodes.nodes import Nodes
-from dora_systemd.runner.reload.sources import Change
+from dora_systemd.runner.reload.sources import Change, Versions
 from dora_systemd.runner.reload.swap import NotReady, Swapper
-from dora_systemd.runner.reload.versions import Versions
 
 _GONE = ("finished", "stopped")
 _BACK = {How.ADD: How.REMOVE, How.REMOVE: How.ADD}

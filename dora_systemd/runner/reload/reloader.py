@@ -27,10 +27,8 @@ from dora_systemd.runner.cell.failure import words
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.reload.apply import Applier, Run, is_read
 from dora_systemd.runner.reload.settings_file import SettingsFile
-from dora_systemd.runner.reload.sources import Change, Sources
+from dora_systemd.runner.reload.sources import Change, Sources, Versions, Watcher
 from dora_systemd.runner.reload.swap import NotReady, patience
-from dora_systemd.runner.reload.versions import Versions
-from dora_systemd.runner.reload.watcher import Watcher
 from dora_systemd.values import quoted
 
 PAUSE_SECONDS = 1.0

@@ -1,13 +1,16 @@
-"""Reads the files of a dataflow, and finds what has changed and what that means."""
+"""Reads and watches the files of a dataflow, and finds what has changed and what that means."""
 
+import asyncio
 import json
-from collections.abc import Collection, Iterable, Mapping
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 
 from dora_systemd.adapters.dora.check import refusal_of_dora
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
-from dora_systemd.adapters.host.watch import identity
+from dora_systemd.adapters.host.watch import Identity, Since, changed_files, identity, watch_rules
 from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.launch import kinds, launch_descriptor, sources
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -17,7 +20,57 @@ from dora_systemd.decisions.reload.imports import program_files, syntax_error
 from dora_systemd.decisions.reload.steps import How, Step, plan_steps
 from dora_systemd.decisions.reload.watch_rules import WatchRules
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.runner.reload.versions import Versions
+from dora_systemd.runner.cell.begin import let_openssl_in
+
+
+class Versions:
+    """The identities of the files that each node runs.
+
+    A file of the dataflow itself, such as its settings, stands in the place of a node.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, dict[str, Identity | None]] = {}
+
+    def take(self, node: str, paths: Iterable[str]) -> None:
+        """Note that `node` runs the present versions of `paths`, and no other files."""
+        self._known[node] = _identities(paths)
+
+    def merge(self, taken: "Versions") -> None:
+        """Note what was taken before, once it is true."""
+        self._known |= taken._known
+
+    def add(self, node: str, paths: Iterable[str], begun_ns: int) -> None:
+        """Note the present versions of those `paths` that are not known yet.
+
+        A file that was written since `begun_ns` stays unknown: the node may run an older version.
+        One that seems to be written later than now is from before somebody set the clock.
+        """
+        known = self._known.setdefault(node, {})
+        present = _identities(set(paths) - known.keys())
+        now_ns = time.time_ns()  # not earlier: a file can be saved while others are looked up
+        for path, one in present.items():
+            if one is None or not begun_ns < one.changed_ns <= now_ns:
+                known[path] = one
+
+    def known(self) -> Iterator[tuple[str, Identity | None]]:
+        """The known versions of all files. May be called in any thread."""
+        for files in list(self._known.values()):
+            yield from list(files.items())
+
+    def differ(self, path: str) -> bool:
+        """Whether a file of the dataflow itself is another one, or has come or gone."""
+        return self._known.get(path, {}).get(path) != identity(path)
+
+    def stale(self, node: str, paths: Iterable[str]) -> set[str]:
+        """Return those `paths` of which another version is there than `node` runs."""
+        known = self._known.get(node, {})
+        now = _identities(paths)
+        return {path for path, one in now.items() if one is not None and known.get(path) != one}
+
+
+def _identities(paths: Iterable[str]) -> dict[str, Identity | None]:
+    return {path: identity(path) for path in paths}
 
 
 @dataclass(frozen=True)
@@ -171,3 +224,56 @@ def _read(path: str) -> str | None:
         return Path(path).read_text(errors="replace")
     except OSError:
         return None
+
+
+_LONGEST = 10.0
+"""Seconds that whoever switches it on waits for a large tree."""
+
+
+class Watcher:
+    """Reports changed files.
+
+    found: takes the files that have changed. refusing: reports an exception inside. has_moved:
+    whether links lead to another dataflow.
+    """
+
+    def __init__(
+        self,
+        found: Callable[[frozenset[str]], None],
+        refusing: Callable[[str], AbstractContextManager[None]],
+        has_moved: Callable[[], bool] = bool,
+    ) -> None:
+        self._found = found
+        self._has_moved = has_moved
+        self._refusing = refusing
+        self._task: asyncio.Task[None] | None = None
+        self._has_seen = asyncio.Event()
+
+    def watch(self, options: RunnerOptions | None, since: Since | None = None) -> None:
+        """Watch the files of these options; None: watch nothing.
+
+        since: report what was saved after that; by default, after this call.
+        """
+        since = since or Since(time.monotonic_ns())
+        if self._task is not None:
+            self._task.cancel()
+        self._has_seen.clear()
+        self._task = None if options is None else asyncio.create_task(self.collect(options, since))
+
+    async def wait_seeing(self) -> None:
+        """Return once a file that changes is noticed, or watching has failed."""
+        if self._task is None:
+            return
+        seen = asyncio.create_task(self._has_seen.wait())
+        first = asyncio.FIRST_COMPLETED
+        await asyncio.wait({self._task, seen}, timeout=_LONGEST, return_when=first)
+        seen.cancel()
+
+    async def collect(self, options: RunnerOptions, since: Since | None = None) -> None:
+        """Give the files that change to found(), without end."""
+        with self._refusing("cannot watch files any more"):
+            rules = await asyncio.to_thread(watch_rules, options)
+            let_openssl_in()  # watchfiles imports anyio, which imports ssl
+            seen, has_moved = self._has_seen.set, self._has_moved
+            async for files in changed_files(rules, seen, has_moved, since=since):
+                self._found(files)

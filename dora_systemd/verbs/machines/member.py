@@ -219,7 +219,7 @@ def _start_transient(
 def _connected(part: Part) -> tuple[socket.socket, socket.socket]:
     """A connection to a runner that is yet to start, and what it shall have as standard input.
 
-    The runner finds the other end of the connection there, see runner/machines/member_boot.py.
+    The runner finds the other end of the connection there, see runner/machines/boot.py.
     """
     own, theirs = socket.socketpair()
     giving, stdin = socket.socketpair()

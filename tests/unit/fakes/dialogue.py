@@ -10,8 +10,8 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.values import SECOND
 from tests.unit.fakes.run import Calls, FakeDora, FakeNodes, FakePipes
 

@@ -12,12 +12,11 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.reload.steps import How, Step
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.reload.apply import Applier, Run
-from dora_systemd.runner.reload.sources import Change
+from dora_systemd.runner.reload.sources import Change, Versions
 from dora_systemd.runner.reload.swap import Swapper
-from dora_systemd.runner.reload.versions import Versions
 from dora_systemd.values import SECOND
 from tests.unit.fakes.run import Calls, FakeDora, FakeNodes, FakePipes
 

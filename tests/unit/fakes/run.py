@@ -23,8 +23,8 @@ from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.nodes.groups import Resources
 from dora_systemd.runner.nodes.nodes import Nodes
-from dora_systemd.runner.nodes.resources import Resources
 
 Calls = list[tuple[Any, ...]]
 """What the fakes of one run were asked to do, in its order."""

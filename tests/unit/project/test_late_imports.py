@@ -11,9 +11,6 @@ LATE = {
     "a list of nothing, or of what has this version's Description=, does without it": {
         "verbs.facts.cells": {"decisions.cell.options"},
     },
-    "ctypes is memory: only dataflows with needs have it": {
-        "runner.needs.needs": {"runner.needs.watch"},
-    },
     "the gateway does without it until somebody looks at releases, or rolls back": {
         "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
         "gateway.live.act": {"verbs.releases.on_trial", "verbs.releases.rollback"},
@@ -62,7 +59,7 @@ LATE = {
         "verbs.facts.recorded": {"adapters.bus.systemd", "verbs.facts.cells"},
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
-        "runner.nodes.losses": {"adapters.journal.reader"},
+        "runner.nodes.lost_entries": {"adapters.journal.reader"},
         "verbs.stop": {
             *("adapters.host.unit_files", "adapters.journal.reader", "decisions.unit.file"),
             *("verbs.start.claim", "verbs.start.enable"),
@@ -90,7 +87,10 @@ LATE = {
     },
     "most dataflows owe nothing, wait for nothing, never restarted, and run on one machine": {
         "adapters.dora.preparation": {"adapters.dora.probe", "decisions.machines.part"},
-        "runner.owes.begin": {"runner.owes.watch"},
+        "runner.main": {
+            *("runner.machines.head", "runner.machines.member", "runner.needs"),
+            "runner.owes.watch",
+        },
         "verbs.facts.reading": {
             *("decisions.machines.usage", "decisions.owes.feeds", "decisions.owes.probe"),
             *("verbs.facts.held", "verbs.facts.budget"),
@@ -100,7 +100,6 @@ LATE = {
         "runner.owes.listen": {"dora"},
     },
     "most dataflows run on one machine and have no releases, and most links are not lost": {
-        "runner.roles": {"runner.machines.head", "runner.machines.member"},
         "gateway.control.logs": {"decisions.machines.elsewhere"},
         "gateway.live.lines": {"decisions.machines.elsewhere"},
         "cli.foreground": {"verbs.facts.machines", "verbs.remote.attached"},
@@ -130,8 +129,8 @@ LATE = {
         },
     },
     "most dataflows have no notify sockets": {
-        "runner.signs.hook": {"runner.signs.sockets"},
-        "runner.cell.dialogue": {"runner.signs.watch"},
+        "runner.nodes.nodes": {"runner.nodes.watchdog"},
+        "runner.cell.dialogue": {"runner.nodes.watchdog"},
         "verbs.facts.list": {"decisions.signs.table"},
     },
     "asyncio and WebSockets: of all verbs, a few need one of them": {
@@ -145,12 +144,12 @@ LATE = {
     "the coordinator boots while the rest of the runner is imported": {
         "runner.__main__": {
             *("adapters.dora.check", "runner.cell.boot", "runner.main"),
-            *("runner.machines.boot", "runner.machines.boot"),
+            "runner.machines.boot",
         },
         "runner.cell.begin": {"adapters.dora.command", "runner.nodes.rights"},
-        "runner.cell.pause": {
+        "runner.cell.restarts": {
             *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
-            *("decisions.cell.status", "asyncio"),
+            *("adapters.host.unit_files", "decisions.cell.status", "asyncio"),
         },
     },
     "systemd runs it after every life, and it has nothing to do unless the runner was killed": {

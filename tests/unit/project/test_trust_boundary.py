@@ -57,7 +57,7 @@ _TABLE = {
     KERNEL: """
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
         adapters.host.process_table adapters.host.real_time adapters.host.rights
-        runner.cell.pause trust.socket_table verbs.destroy
+        runner.cell.restarts trust.socket_table verbs.destroy
         link.relay verbs.facts.lives verbs.start.sandbox
     """,
     ROOTS: """
@@ -80,8 +80,8 @@ _TABLE = {
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
         adapters.runner_socket.address
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
-        runner.cell.life runner.machines.boot
-        adapters.host.presence runner.asked.hand runner.needs.needs runner.nodes.gate
+        runner.cell.restarts runner.machines.boot
+        adapters.host.presence runner.requests runner.needs runner.nodes.launcher_gates
         runner.cell.engine runner.cell.pump runner.machines.head runner.machines.roster
         runner.main runner.nodes.nodes
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post

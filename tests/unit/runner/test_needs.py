@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.host.presence import look_at, watched_places
-from dora_systemd.runner.needs.watch import Watch
+from dora_systemd.runner.needs import Watch
 
 LONG = 60.0
 """Seconds; a test that waits for so long has failed."""

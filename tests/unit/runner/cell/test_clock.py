@@ -1,5 +1,9 @@
 """One budget for a stop: what TimeoutStopSec= allows, and what each part of the end may take."""
 
+import asyncio
+import threading
+import time
+
 import pytest
 
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -10,7 +14,7 @@ from dora_systemd.decisions.life.stop_budget import (
     unit_timeout,
 )
 from dora_systemd.decisions.unit.properties import stop_properties
-from dora_systemd.runner.cell.clock import BACKLOG_SECONDS, STOP_SECONDS, StopClock
+from dora_systemd.runner.cell.clock import BACKLOG_SECONDS, STOP_SECONDS, Keepalive, StopClock
 from dora_systemd.values import INFINITY, SECOND
 
 
@@ -73,3 +77,51 @@ def test_endless_grace() -> None:
     clock.begin("SIGTERM")
     clock.at += 10**9
     assert clock.left(7.0) == 7.0
+
+
+def test_a_loop_that_is_held_up_is_alive_for_a_while() -> None:
+    sent = threading.Semaphore(0)
+    keepalive = Keepalive(0.01, sent.release)
+
+    async def work() -> None:
+        task = asyncio.create_task(keepalive.beat())
+        await asyncio.sleep(0)
+        for _ in range(3):
+            assert sent.acquire(timeout=20), "the loop stands still meanwhile"
+        task.cancel()
+
+    asyncio.run(work())
+    assert sent.acquire(timeout=20), "also while the last lines are written"
+    keepalive.end()
+
+
+def test_a_loop_that_hangs_is_not_alive() -> None:
+    sent: list[float] = []
+    keepalive = Keepalive(0.01, lambda: sent.append(time.monotonic()), patience=0.3)
+
+    async def work() -> float:
+        task = asyncio.create_task(keepalive.beat())
+        await asyncio.sleep(0)
+        begun = time.monotonic()
+        time.sleep(1)
+        task.cancel()
+        return begun
+
+    begun = asyncio.run(work())
+    keepalive.end()
+    assert not [one for one in sent if begun + 0.35 < one < begun + 1]
+
+
+def test_a_runner_that_exits_does_not_wait_for_it() -> None:
+    keepalive = Keepalive(0.01, lambda: None)
+
+    async def work() -> None:
+        task = asyncio.create_task(keepalive.beat())
+        await asyncio.sleep(0)
+        own = [one for one in threading.enumerate() if one.name == "keepalive"]
+        assert own
+        assert all(one.daemon for one in own)
+        task.cancel()
+
+    asyncio.run(work())
+    keepalive.end()

@@ -21,9 +21,8 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside
-from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump, is_deleted
-from dora_systemd.runner.signs.none import NoSigns
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.values import SECOND
 from tests.unit.fakes.loop import live
 
@@ -39,7 +38,7 @@ class Side:
         self.replies: list[Reply] = []
         self.hangs = False
         self.resources = SimpleNamespace(look=lambda *_: [])
-        self.signs = NoSigns()
+        self.notify_sockets = None
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         def call(*_: Any) -> Any:

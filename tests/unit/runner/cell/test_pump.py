@@ -17,8 +17,8 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, State
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.values import SECOND
 from tests.unit.fakes.libraries import hear_notifications, install
 from tests.unit.fakes.loop import live

@@ -21,7 +21,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.machines.head import HeadDialogue
 from dora_systemd.runner.machines.roster import Roster
 from dora_systemd.runner.machines.shared import HeadEngine

@@ -23,7 +23,7 @@ from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.machines.member import Member
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, find_pids
 from dora_systemd.runner.machines.shared import MemberEngine

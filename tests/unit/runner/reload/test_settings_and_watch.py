@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import time
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,8 +21,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile, main
-from dora_systemd.runner.reload.sources import check_programs
-from dora_systemd.runner.reload.watcher import Watcher
+from dora_systemd.runner.reload.sources import Versions, Watcher, check_programs
 from dora_systemd.values import SECOND
 
 FLOW = "nodes: [{{id: a, path: {path}}}]\n"
@@ -230,3 +230,23 @@ def test_whoever_switches_it_on_may_save_at_once(tmp_path: Path) -> None:
         await watcher.wait_seeing()
 
     live(work)
+
+
+@pytest.mark.parametrize("is_saved", [True, False])
+def test_a_file_that_is_saved_while_versions_are_noted_stays_unknown(
+    tmp_path: Path, is_saved: bool
+) -> None:
+    """The paths come one after the other, from a search that takes its time."""
+    path = tmp_path / "words.py"
+    path.touch()
+    begun_ns = time.time_ns()
+    versions = Versions()
+
+    def found() -> list[str]:
+        if is_saved:
+            while path.stat().st_ctime_ns <= begun_ns:  # the clock of files has ticks
+                os.utime(path)
+        return [str(path)]
+
+    versions.add("sink", found(), begun_ns)
+    assert versions.stale("sink", [str(path)]) == ({str(path)} if is_saved else set())

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.nodes.losses import LossWatch
+from dora_systemd.runner.nodes.lost_entries import LossWatch
 
 
 class Case:

@@ -1,23 +1,27 @@
-"""Delays a restart: the delay grows with each restart, until a quiet window resets it.
+"""Restarts of the unit: whether this is its first life, the delay before this one, and the budget.
 
 RestartSteps= of systemd.service(5) counts all restarts since the unit was started, so two failures
 months apart would lengthen the delay. Therefore RestartSec= is the shortest delay without
 HEAD_START. The runner waits for the rest: before it does anything else if the delay is longer than
-the shortest, else when it has prepared all that comes before the nodes. systemd keeps the number of
-restarts, see lives() in dora_systemd.adapters.host.fd_store.
+the shortest, else when it has prepared all that comes before the nodes. The delay grows with each
+restart, until a quiet window resets it. systemd keeps the number of restarts, see lives() in
+dora_systemd.adapters.host.fd_store.
 
 StartLimitBurst= counts all starts, also those by hand, so it is only a backstop: the runner counts
 the automatic restarts, and refuses the one that would exceed the budget.
+
+Most imports are late: they take longer than everything before the coordinator.
 """
 
 import contextlib
 import os
 import time
+from functools import partial
 from pathlib import Path
 
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.restarts import HEAD_START, count_restarts
+from dora_systemd.decisions.cell.restarts import HEAD_START, RestartPolicy, count_restarts
 from dora_systemd.errors import DoraSystemdError, RestartsSpent
 from dora_systemd.names import unit_name
 from dora_systemd.paths import CellPaths
@@ -96,12 +100,12 @@ def asked(what: str, name: str, is_user: bool, otherwise: int) -> int:
 
     A reset or a restart of the unit sets NRestarts to 0.
     """
-    from dora_systemd.adapters.host import process
+    from dora_systemd.adapters.host.process import run_command
 
     scope = ["--user"] if is_user else []
     command = ["systemctl", *scope, "show", "--value", f"--property={what}", unit_name(name)]
     with contextlib.suppress(DoraSystemdError, ValueError):
-        return int(process.run_command(command, _ASK_SECONDS).stdout)
+        return int(run_command(command, _ASK_SECONDS).stdout)
     return otherwise
 
 
@@ -121,10 +125,83 @@ def show(uuid: str, paths: CellPaths, seconds: float) -> None:
 
 async def forget_restarts(options: RunnerOptions) -> None:
     """Reset the delay after a quiet window."""
-    import asyncio  # imported late: it takes longer than everything before the coordinator
+    import asyncio
 
     if options.restart.policy != "no" and options.restart.window != INFINITY:
         await asyncio.sleep(options.restart.window / SECOND)
         fd_store.forget_lives()
         # The window of this life is over: its next restart begins another one.
         fd_store.count_life(_now_us() - options.restart.window)
+
+
+_TICK = SECOND // os.sysconf("SC_CLK_TCK")
+"""The accuracy of the start of a process."""
+ASK_SECONDS = 5.0
+"""Until learn_first() asks: when most dataflows have started, which the question must not delay."""
+
+
+def is_first_life(policy: RestartPolicy, name: str, is_user: bool) -> bool:
+    """Whether NRestarts= of the unit is certainly 0.
+
+    A life that ended before the runner had begun has left nothing in the descriptor store. So it
+    must also be too early for a restart: systemd writes the file of a transient unit when it queues
+    the start, and waits for RestartSec= after each life.
+    """
+    from dora_systemd.adapters.host.unit_files import written_us
+
+    if policy.policy == "no":
+        return True
+    if not fd_store.is_first_life():
+        return False
+    began = time.time_ns() // 1000 - int(age() * SECOND)
+    return 0 <= began + _TICK - written_us(_transient(name, is_user)) < policy.unit_delay
+
+
+def is_transient(name: str, is_user: bool) -> bool:
+    """Whether systemd has the unit from a client, and not from a file that a boot may start."""
+    return _transient(name, is_user).exists()
+
+
+def _transient(name: str, is_user: bool) -> Path:
+    """The file of a transient unit, see UnitPath in systemd.unit(5)."""
+    root = os.environ.get("XDG_RUNTIME_DIR", "") if is_user else "/run"
+    return Path(root, "systemd/transient", unit_name(name))
+
+
+class Life:
+    """The time between two starts of the unit: the same for all its runs."""
+
+    def __init__(self, uuid: str, is_first: bool = False, may_be_first: bool = False) -> None:
+        self.uuid = uuid  # of the dataflow
+        self.is_first = is_first  # systemd has certainly not restarted the unit
+        self.may_be_first = may_be_first  # only systemd knows that
+        self.up_us = 0  # CLOCK_MONOTONIC, as ActiveEnterTimestampMonotonic=; 0 before that
+
+    def become_up(self) -> None:
+        """The nodes are ready. A run after a reload changes nothing: the unit has been up."""
+        self.up_us = self.up_us or time.monotonic_ns() // 1000
+
+
+def begin_life(options: RunnerOptions, is_user: bool) -> Life:
+    """The life that begins with this process."""
+    is_first = is_first_life(options.restart, options.name, is_user)
+    return Life(options.uuid, is_first, not is_first and fd_store.is_first_life())
+
+
+async def learn_first(life: Life, name: str, is_user: bool, seconds: float = ASK_SECONDS) -> None:
+    """Ask systemd once whether it has restarted the unit, if that is all that is not known.
+
+    That is so of each unit that doractl enable has written. Without it every `list` would ask: the
+    number does not change before the next life, and a reset only makes it 0. seconds: to wait
+    before that.
+    """
+    import asyncio
+
+    from dora_systemd.adapters.host.process import beside
+
+    if life.may_be_first:
+        await asyncio.sleep(seconds)
+        # No thread or process may be left for it: then list asks.
+        with contextlib.suppress(OSError, RuntimeError):
+            question = beside(partial(asked, "NRestarts", name, is_user, 1))
+            life.is_first = await asyncio.wrap_future(question) == 0

@@ -8,8 +8,8 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
-from dora_systemd.runner.cell.life import Life
-from dora_systemd.runner.cell.role import Alone
+from dora_systemd.runner.cell.machine_role import Alone
+from dora_systemd.runner.cell.restarts import Life
 from tests.unit.fakes.dialogue import OPTIONS, Bench
 from tests.unit.fakes.loop import live
 from tests.unit.fakes.programs import make_program

@@ -1,6 +1,7 @@
 """What the runner has dora do when somebody asks for a restart or a stop of one node."""
 
 import asyncio
+import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -9,19 +10,20 @@ import pytest
 
 from dora_systemd.adapters.dora.preparation import prepare
 from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.asked.hand import end_held
-from dora_systemd.runner.asked.requests import NodeRequests
-from dora_systemd.runner.cell.life import Life
-from dora_systemd.runner.cell.role import Alone
-from dora_systemd.runner.nodes.gate import Gates
+from dora_systemd.runner.cell.machine_role import Alone
+from dora_systemd.runner.cell.restarts import Life
+from dora_systemd.runner.nodes.launcher_gates import Gates
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
+from dora_systemd.runner.requests import NodeRequests, Recheck, end_held
 from dora_systemd.values import SECOND
+from tests.unit.fakes.programs import make_dora
 from tests.unit.fakes.reload import EXCHANGES, ReloadBench
 
 RUNNING = NodeStatus("running", 7, policy="on-failure", max_restarts=2)
@@ -309,3 +311,48 @@ def test_other_requests_are_for_reloads(tmp_path: Path) -> None:
         assert await bench.requests.answer({"verb": "hot-reload", "on": False}) == {"done": []}
 
     run(tmp_path, scene)
+
+
+FLOW = "nodes: [{id: a, path: a.py, outputs: [x]}]"
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> RunnerOptions:
+    (tmp_path / "a.py").write_text("import b\n")
+    (tmp_path / "b.py").write_text("")
+    (flow := tmp_path / "robot.yml").write_text(FLOW)
+    return RunnerOptions(
+        "robot", "", str(flow), str(tmp_path), make_dora(tmp_path / "dora", "1.1.0")
+    )
+
+
+def ask(options: RunnerOptions, **request: Any) -> dict[str, Any]:
+    async def others(request: Any) -> dict[str, Any]:
+        return {"done": [request["verb"]]}
+
+    role = Alone(options, Life(options.uuid))
+    return asyncio.run(Recheck(role, os.environ, others).answer(request))
+
+
+def test_what_could_start(options: RunnerOptions) -> None:
+    assert ask(options, verb="check") == {"refused": None}
+
+
+def test_all_other_requests(options: RunnerOptions) -> None:
+    assert ask(options, verb="reload") == {"done": ["reload"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("robot.yml", FLOW.replace("path:", "pth:"), "node a has no path"),
+        ("a.py", "def (", "line 1: invalid syntax"),
+        ("b.py", "def (", "line 1: invalid syntax"),
+        ("robot.yml", "", "robot.yml"),
+    ],
+)
+def test_what_could_not(options: RunnerOptions, name: str, text: str, words: str) -> None:
+    Path(options.working_directory, name).write_text(text)
+    refused = ask(options, verb="check")["refused"]
+    assert words in refused["error"]
+    assert name in refused["error"]

@@ -19,8 +19,8 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
-from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.nodes.nodes import Nodes
 
 if TYPE_CHECKING:

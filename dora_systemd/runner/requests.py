@@ -1,28 +1,119 @@
-"""Answers what people ask of single nodes at the runner's socket: a restart, or a stop.
+"""Answers what people ask at the socket of the runner of single nodes, and before a restart.
 
-Each is recorded before it is done, see decisions/cell/asked.py.
+A request for a node is recorded before it is carried out, see decisions/cell/asked.py. A restart
+replaces the process as a reload does, see runner/reload/swap.py. Nothing brings back a node after
+StopNode of dora. So the Hand does otherwise:
+
+                     nobody reads the node    others read it
+    stop             RemoveNode               as a restart, and its launcher waits at a closed gate
+    restart after it AddNode                  opens the gate
+
+A node with readers is only removed if it has no launcher of ours.
 """
 
+import asyncio
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+from dora_systemd.adapters.runner_socket.client import Request, refused_reply
+from dora_systemd.adapters.runner_socket.listener import Answer
 from dora_systemd.decisions.cell.asked import RESTART, STOP, format_asked, is_stopped
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
+from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.nodes import held, is_over_but_for_held
 from dora_systemd.decisions.life.states import Cell, State
+from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.decisions.needs.words import format_wait
-from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.runner.asked.hand import Hand
+from dora_systemd.errors import DoraSystemdError, ExitCode, TimedOut
+from dora_systemd.runner.cell.machine_role import Alone
 from dora_systemd.runner.cell.pump import now_us
-from dora_systemd.runner.cell.role import Alone
+from dora_systemd.runner.check import check_start
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.reloader import Reloader
-from dora_systemd.runner.reload.swap import Target
-from dora_systemd.values import quoted
+from dora_systemd.runner.reload.sources import Sources, check_programs
+from dora_systemd.runner.reload.swap import Target, of_node
+from dora_systemd.values import SECOND, quoted
 
-Answer = dict[str, Any]
+
+class Hand:
+    """Acts on nodes of `run`, whose lock the caller holds."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self._removed: set[str] = set()
+        self._left: dict[str, int] = {}
+
+    async def replace(self, target: Target) -> None:
+        """End the process of a node, and start the next one. Raises DoraSystemdError."""
+        with self.run.nodes.exchanging(target.node):
+            await self.run.swapper.replace(target)
+
+    async def stop(self, target: Target) -> None:
+        """End a node, so that bring_back() can start it again. Raises DoraSystemdError."""
+        with self.run.nodes.exchanging(target.node):
+            if self._can_hold(target):
+                await self._hold(target)
+            else:
+                await self._remove(target)
+
+    def _can_hold(self, target: Target) -> bool:
+        is_here = not target.status.machine
+        is_running = self.run.pump.cell.state is State.RUNNING  # else dora waits for the launcher
+        return (
+            target.has_readers
+            and is_here
+            and is_running
+            and self.run.nodes.has_gate_for(target.node)
+        )
+
+    async def _hold(self, target: Target) -> None:
+        node, gates = target.node, self.run.nodes.gates
+        gates.add(node)
+        gates.close(node)
+        if target.status.state == "waiting":
+            return  # its launcher is at the gate
+        self._left[node] = target.status.pid
+        await self.run.swapper.hold(target)
+
+    async def _remove(self, target: Target) -> None:
+        node = target.node
+        self._removed.add(node)
+        run, swapper = self.run.pump.cell.run, self.run.swapper
+        await swapper.ask(protocol.node_params("RemoveNode", run, node, target.patience))
+        if target.status.state == "waiting":
+            self.run.nodes.gates.leave(node)
+
+    async def bring_back(self, target: Target) -> None:
+        """Start a node that was stopped. Raises DoraSystemdError."""
+        node, gates = target.node, self.run.nodes.gates
+        await self.run.nodes.wait_gone(node, self._left.pop(node, 0))
+        if node in self._removed:
+            seconds = stop_timeout(target.grace) / SECOND
+            await self.run.pump.wait(of_node(node, lambda one: not one.pid), seconds)
+            gates.reset(node)
+            add = protocol.add_params(self.run.pump.cell.run, target.definition)
+            await self.run.swapper.begin(add)
+            self._removed.discard(node)
+        elif not gates.is_for_needs(node):  # else it is opened when its needs are met
+            gates.open(node)
+
+
+async def end_held(run: Run) -> None:
+    """Let a dataflow end when all nodes but stopped ones have ended: these could come back."""
+
+    def is_over(cell: Cell) -> bool:
+        return cell.state is State.RUNNING and is_over_but_for_held(cell.nodes)
+
+    await run.pump.wait(is_over, None)
+    for node in held(run.pump.cell.nodes):
+        run.nodes.gates.leave(node)
+
+
+Reply = dict[str, Any]
 
 VERB = "node"
 _UNKNOWN_CALLER = "an unknown caller"
@@ -35,7 +126,7 @@ class NodeRequests:
         self._reloader, self._role = reloader, role
         self._hand: Hand | None = None
 
-    async def answer(self, request: Mapping[str, Any]) -> Answer:
+    async def answer(self, request: Mapping[str, Any]) -> Reply:
         """Answer {"verb": "node", "what": "restart", "node": ..., "by": ..., "grace": µs or null}.
 
         Other requests are for the reloader. Raises DoraSystemdError.
@@ -138,3 +229,39 @@ def _require_running(cell: Cell) -> None:
 def _not_running(why: str) -> DoraSystemdError:
     hint = "doractl list NAME says what it does"
     return DoraSystemdError(f"cannot restart or stop a node: {why}", hint, ExitCode.NOT_RUNNING)
+
+
+class Recheck:
+    """Answers {"verb": "check"}; `answer` answers all other requests.
+
+    environment: of the nodes.
+    """
+
+    def __init__(self, role: Alone, environment: Mapping[str, str], answer: Answer) -> None:
+        self._role, self._environment, self._others = role, environment, answer
+        role.find_own_refusal = self.find_refusal
+
+    async def answer(self, request: Request) -> dict[str, Any]:
+        """Answer one request. Raises DoraSystemdError as `answer` does."""
+        if request.get("verb") != "check":
+            return await self._others(request)
+        refusal = await asyncio.to_thread(self.find_refusal)
+        return refused_reply(refusal or await self._role.find_refusal())
+
+    def find_refusal(self) -> DoraSystemdError | None:
+        """Check the dataflow; the error that a start would end with, or None."""
+        try:
+            self._check()
+        except TimedOut:
+            return None  # a busy machine says nothing about the files
+        except DoraSystemdError as error:
+            return error
+        return None
+
+    def _check(self) -> None:
+        role, options = self._role, self._role.options
+        _, prepared = check_start(options, role.own(options), self._environment)
+        role.check(prepared.dataflow)
+        here = replace(prepared, dataflow=role.here(prepared.dataflow))
+        files = Sources(options, self._environment).files(here)
+        check_programs(sorted(frozenset().union(*files.values())))

@@ -1,13 +1,14 @@
-"""The pause before a restart: it grows, is seen, and begins anew after a quiet window."""
+"""The first life of a unit, the delay before a restart, and the budget."""
 
 import asyncio
 import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,17 +21,23 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import HEAD_START, RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.pause import (
+from dora_systemd.runner.cell.restarts import (
+    Life,
     age,
     asked,
+    begin_life,
     find_spent,
     forget_restarts,
     hold_back,
+    is_first_life,
+    is_transient,
+    learn_first,
     pause,
     show,
 )
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.loop import live
+from tests.unit.fakes.manager import options
 from tests.unit.fakes.programs import make_program
 
 DELAY = SECOND // 2
@@ -222,7 +229,7 @@ def test_the_delay_begins_when_the_last_life_has_ended(
 
 
 def test_the_age_of_a_process() -> None:
-    code = "import time; from dora_systemd.runner.cell.pause import age; print(age())"
+    code = "import time; from dora_systemd.runner.cell.restarts import age; print(age())"
     began = time.monotonic()
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
     assert -0.02 < float(printed) < time.monotonic() - began + 0.02
@@ -321,3 +328,123 @@ def test_what_never_restarts_or_never_forgets_does_not_wait(
     live(work)
     unit.keep_store()
     assert unit.store["dora-life"] == counted
+
+
+ON_FAILURE = RestartPolicy("on-failure", delay=2 * SECOND)
+
+
+@pytest.fixture
+def unit_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """That of a transient unit that starts right now, for the first time."""
+    monkeypatch.setenv("FDSTORE", "4096")
+    monkeypatch.delenv("LISTEN_FDNAMES", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    path = tmp_path / "systemd/transient/dora-robot.service"
+    path.parent.mkdir(parents=True)
+    path.touch()
+    os.utime(path, (time.time() - age() - 0.1,) * 2)
+    return path
+
+
+@pytest.mark.usefixtures("unit_file")
+def test_a_start() -> None:
+    assert is_first_life(ON_FAILURE, "robot", is_user=True)
+    assert not is_first_life(ON_FAILURE, "other", is_user=True)
+
+
+@pytest.mark.parametrize("seconds", [-ON_FAILURE.unit_delay / SECOND, 60])
+def test_a_life_may_have_been_before(unit_file: Path, seconds: float) -> None:
+    """Or the clock was set."""
+    os.utime(unit_file, (unit_file.stat().st_mtime + seconds,) * 2)
+    assert not is_first_life(ON_FAILURE, "robot", is_user=True)
+    assert is_first_life(RestartPolicy("no"), "robot", is_user=True)
+
+
+@pytest.mark.usefixtures("unit_file")
+def test_a_life_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LISTEN_FDNAMES", "dora-life")
+    assert not is_first_life(ON_FAILURE, "robot", is_user=True)
+
+
+Learn = Callable[[str, int], tuple[bool, list[str]]]
+ASKED = ["--user show --value --property=NRestarts dora-enabled.service"]
+
+
+@pytest.fixture
+def learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Learn:
+    """Whether a life knows in the end that it is the first one, and what it has asked systemctl."""
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    asked = tmp_path / "asked"
+
+    def learn(name: str, restarts: int) -> tuple[bool, list[str]]:
+        asked.write_text("")
+        make_program(tmp_path / "systemctl", f'echo "$@" >> {asked}; echo {restarts}')
+        begun = begin_life(options(name, restart=ON_FAILURE), is_user=True)
+        asyncio.run(learn_first(begun, name, is_user=True, seconds=0.0))
+        return begun.is_first, asked.read_text().splitlines()
+
+    return learn
+
+
+@pytest.mark.usefixtures("unit_file")
+def test_systemd_is_asked_once_for_what_only_it_knows(
+    learned: Learn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert learned("robot", 0) == (True, [])
+    assert learned("enabled", 0) == (True, ASKED)
+    assert learned("enabled", 1) == (False, ASKED)
+    monkeypatch.setenv("LISTEN_FDNAMES", "dora-life")
+    assert learned("enabled", 0) == (False, [])
+
+
+@pytest.mark.usefixtures("unit_file")
+def test_no_thread_is_left_to_ask(learned: Learn, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_thread: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    assert learned("enabled", 0) == (False, [])
+
+
+@pytest.mark.parametrize(
+    ("after", "is_first"),
+    [
+        (-ON_FAILURE.unit_delay / SECOND + 0.05, True),
+        (-ON_FAILURE.unit_delay / SECOND - 0.05, False),
+        (-0.02, True),
+        (0.05, False),
+    ],
+)
+def test_only_a_start_that_was_just_queued_is_the_first(
+    unit_file: Path, after: float, is_first: bool
+) -> None:
+    """systemd writes the file then, before the process begins; a restart comes after its delay."""
+    os.utime(unit_file, (time.time() - age() + after,) * 2)
+    assert is_first_life(ON_FAILURE, "robot", is_user=True) == is_first
+
+
+def test_a_life(monkeypatch: pytest.MonkeyPatch, unit_file: Path) -> None:
+    begun = begin_life(options("robot", restart=ON_FAILURE), is_user=True)
+    assert (begun.uuid, begun.is_first, begun.may_be_first) == (options().uuid, True, False)
+    assert begun.up_us == 0
+    begun.become_up()
+    first = begun.up_us
+    assert 0 < first <= time.monotonic_ns() // 1000
+    begun.become_up()
+    assert begun.up_us == first
+    unit_file.unlink()
+    later = begin_life(options("robot", restart=ON_FAILURE), is_user=True)
+    assert (later.is_first, later.may_be_first) == (False, True), "systemd knows"
+    monkeypatch.setenv("LISTEN_FDNAMES", "dora-life")
+    later = begin_life(options("robot", restart=ON_FAILURE), is_user=True)
+    assert (later.is_first, later.may_be_first) == (False, False)
+    plain = Life("uuid")
+    assert (plain.is_first, plain.may_be_first) == (False, False)
+
+
+def test_whose_unit_is_transient(unit_file: Path) -> None:
+    assert is_transient("robot", is_user=True)
+    assert not is_transient("other", is_user=True)
+    assert not is_transient("robot", is_user=False), "root's are in /run"
+    unit_file.unlink()
+    assert not is_transient("robot", is_user=True)

@@ -1,16 +1,17 @@
-"""Waits for what nodes need: one task of a run, only if a node has needs.
+"""Waits for what nodes need: tasks of a run, only if a node has needs.
 
 A thread looks at the paths, because a file system may hang. It looks when a directory on the way to
 one of them changes, and every _LOOK_SECONDS: not all file systems tell of changes. The decisions
-are in decisions/needs/steps.py, the gates in runner/nodes/gate.py.
+are in decisions/needs/steps.py, the gates in runner/nodes/launcher_gates.py.
 """
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Coroutine, Iterator, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 from typing import Any
 
 from dora_systemd.adapters.host import notify
+from dora_systemd.adapters.host.inotify import Inotify
 from dora_systemd.adapters.host.presence import Presence, look_at, watched_places
 from dora_systemd.decisions.cell.needs import paths_by_node
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -23,6 +24,53 @@ from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.values import INFINITY, SECOND
 
+
+class Watch:
+    """Directories that are watched by inotify(7). Close it.
+
+    Where the kernel has no inotify instance left, wait() waits for its whole time.
+    """
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._event = asyncio.Event()
+        self._inotify: Inotify | None = None
+        with contextlib.suppress(OSError):
+            self._inotify = Inotify()
+            self._loop.add_reader(self._inotify.fd, self._read)
+
+    def _read(self) -> None:
+        assert self._inotify is not None
+        self._inotify.drain()
+        self._event.set()
+
+    def set_places(self, directories: Iterable[str]) -> None:
+        """Watch these directories instead of those before; a thread may call this."""
+        if self._inotify is not None:
+            self._inotify.watch(directories)
+
+    def clear(self) -> None:
+        """Forget the changes so far."""
+        self._event.clear()
+
+    def wake(self) -> None:
+        """Let the task look again."""
+        self._event.set()
+
+    async def wait(self, seconds: float) -> None:
+        """Wait for a change, at most `seconds`."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._event.wait()
+
+    def close(self) -> None:
+        """Stop watching."""
+        if self._inotify is not None:
+            self._loop.remove_reader(self._inotify.fd)
+            self._inotify.close()
+            self._inotify = None
+
+
 _LOOK_SECONDS = 2.0
 _PAUSE_SECONDS = 0.05
 """A directory may change without end, such as /tmp: more looks than this would only cost time."""
@@ -34,15 +82,13 @@ Definition = Callable[[str], Mapping[str, Any]]
 
 
 def wait_for_needs(run: Run, options: RunnerOptions, definition: Definition, spawn: Spawn) -> None:
-    """Close the gates of nodes with needs, and begin to look for what they need.
+    """Begin to look for what nodes need, whose gates are closed.
 
-    definition: a node as dora gets it. spawn: begins a task of the run. Raises OSError.
+    definition: a node as dora gets it. spawn: begins a task of the run.
     """
-    run.nodes.gates.make({one.node for one in options.needs})
-    if options.needs:
-        needs = Needs(run, options, definition, spawn)
-        spawn("wait for what nodes need", needs.work())
-        spawn("see whether failed nodes lack something", needs.latch())
+    needs = Needs(run, options, definition, spawn)
+    spawn("wait for what nodes need", needs.work())
+    spawn("see whether failed nodes lack something", needs.latch())
 
 
 class Needs:
@@ -57,8 +103,6 @@ class Needs:
         self._passed: dict[str, list[Presence]] = {}
         self._losing: set[str] = set()
         self._closed: set[str] = set()
-        # Imported late: only dataflows with needs pay for ctypes.
-        from dora_systemd.runner.needs.watch import Watch
 
         self._watch = Watch()
 

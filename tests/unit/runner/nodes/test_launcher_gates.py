@@ -9,7 +9,7 @@ import pytest
 import dora_systemd
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.nodes.gate import Gates
+from dora_systemd.runner.nodes.launcher_gates import Gates
 
 LAUNCHER = Path(dora_systemd.__file__).parent / "launcher.pl"
 
