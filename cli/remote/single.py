@@ -5,7 +5,7 @@ import sys
 from codecs import IncrementalDecoder, getincrementaldecoder
 from types import FrameType
 
-from dora_systemd.adapters.ssh.program import run_on_terminal
+from dora_systemd.adapters.ssh import run_on_terminal
 from dora_systemd.cli.edge import write_own
 from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.decisions.remote.command import (

@@ -22,9 +22,8 @@ from typing import Any
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import cut
 from dora_systemd.trust import courier
-from dora_systemd.trust.pipes import receive, send
 from dora_systemd.trust.programs import Account, account_of_uid
-from dora_systemd.trust.sight import start_reader
+from dora_systemd.trust.sight import receive, send, start_reader
 from dora_systemd.values import shown
 
 _SECONDS = 90.0

@@ -1,12 +1,15 @@
 """Checks paths that another user names with that user's permissions: root could see too much.
 
 A child process takes on the account and answers; it runs only the few lines of eyes.py. The account
-can trace the child and make it lie, so callers trust an answer no more than the account itself.
+can stop and trace the child and make it lie, so callers trust an answer no more than the account
+itself. The child may also take nothing and say nothing: so send() and receive() wait no longer than
+the caller wants.
 """
 
 import contextlib
 import errno
 import os
+import select
 import subprocess
 import sys
 import time
@@ -16,7 +19,6 @@ from pathlib import Path
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust import eyes
 from dora_systemd.trust.files import MAX_BYTES
-from dora_systemd.trust.pipes import receive, send
 from dora_systemd.trust.programs import Account, spawn
 from dora_systemd.values import shown
 
@@ -28,6 +30,7 @@ _LONGEST = 4096
 _MOST_DIGITS = 4
 _MOST_TIME_DIGITS = 20
 _HEAD = 8
+_CHUNK = 65536
 
 
 class Sight:
@@ -160,3 +163,37 @@ def cannot_reach(user: str, path: str) -> DoraSystemdError:
     message = f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}"
     hint = "put it where that user can read it, or choose another user with --uid"
     return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
+
+
+def send(fd: int, data: bytes, deadline: float) -> None:
+    """Write all of it to the pipe `fd`, until `deadline` (seconds of the monotonic clock).
+
+    Raises BrokenPipeError if nobody takes it in time.
+    """
+    os.set_blocking(fd, False)  # a pipe has 64 KiB
+    while data:
+        _wait(fd, select.POLLOUT, deadline)
+        data = data[os.write(fd, data) :]
+
+
+def receive(fd: int, count: int, deadline: float) -> bytes:
+    """Exactly `count` bytes of the pipe `fd`, until `deadline`.
+
+    Raises BrokenPipeError if they do not come in time, or the pipe ends before.
+    """
+    received = bytearray()
+    while len(received) < count:
+        _wait(fd, select.POLLIN, deadline)
+        chunk = os.read(fd, min(count - len(received), _CHUNK))
+        if not chunk:
+            raise BrokenPipeError
+        received += chunk
+    return bytes(received)
+
+
+def _wait(fd: int, event: int, deadline: float) -> None:
+    # Not select(2): the gateway may have more file descriptors than that can take.
+    poll = select.poll()
+    poll.register(fd, event)
+    if not poll.poll(max(deadline - time.monotonic(), 0) * 1000):
+        raise BrokenPipeError

@@ -1,12 +1,14 @@
 """`doractl logs` and `doractl run`: read the records of a dataflow from the journal."""
 
+import contextlib
 import math
 import os
 import select
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 from dora_systemd.adapters.journal.journalctl import (
@@ -26,7 +28,7 @@ from dora_systemd.decisions.logs.query import (
 )
 from dora_systemd.decisions.logs.records import LOG_FIELDS, Record
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
-from dora_systemd.scope import Scope
+from dora_systemd.scope import Scope, config_home
 
 _TURN = 1 << 14
 """Bytes of records between two looks at what else has happened: a terminal may be slow."""
@@ -36,6 +38,8 @@ _MOST_SECONDS = 30.0
 _FIELDS = ",".join((*LOG_FIELDS, "SYSLOG_IDENTIFIER"))
 
 Write = Callable[[bytes], object]
+_LEFT_OUT = b" blob data]\n"
+"""What journalctl prints in the place of a message with control characters ends with this."""
 
 
 def read_logs(
@@ -53,10 +57,6 @@ def read_logs(
         if query.is_follow:
             yield terminal.flush()  # what has come is shown at once
     yield terminal.flush()
-
-
-_LEFT_OUT = b" blob data]\n"
-"""What journalctl prints in the place of a message with control characters ends with this."""
 
 
 def pass_logs(query: LogQuery, fd: int, on_left_out: Callable[[], object] | None = None) -> int:
@@ -243,3 +243,24 @@ class FollowedLog(Follower):
             if not self.is_readable(0 if self.has_ended else left):
                 return
             self.print_new()
+
+
+def unit_places(scope: Scope, environment: Mapping[str, str]) -> Iterator[Path]:
+    """Where transient units are, and where doractl enable writes units; see systemd.unit(5)."""
+    yield scope.transient_units
+    if not scope.is_user:
+        yield Path("/etc/systemd/system")
+        return
+    if config := config_home(environment):
+        yield Path(config, "systemd/user")
+
+
+def has_unit(places: Iterator[Path], prefix: str) -> bool:
+    """Whether a unit in one of these directories has a name that begins so."""
+    return any(_has_unit(one, prefix) for one in places)
+
+
+def _has_unit(directory: Path, prefix: str) -> bool:
+    with contextlib.suppress(OSError), os.scandir(directory) as entries:
+        return any(one.name.startswith(prefix) for one in entries)
+    return False

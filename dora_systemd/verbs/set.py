@@ -14,7 +14,6 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.limits import limit_groups
-from dora_systemd.adapters.host.machine import read_machine
 from dora_systemd.adapters.host.unit_files import (
     LOG_RATES_FILE,
     NODE_LIMITS_FILE,
@@ -44,7 +43,7 @@ from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.reload import Ask, limit_lines, remember
-from dora_systemd.verbs.start.limits import require_controllers
+from dora_systemd.verbs.start.limits import read_machine, require_controllers
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
 

@@ -25,7 +25,7 @@ KEPT = (
     Kept("trust/socket_table", r"IPPROTO_TCP, 1, 0", "an extension that nothing here asks for"),
     Kept("trust/socket_table", r"recv\(4097\)", "the kernel answers with far less than 4096 bytes"),
     Kept("trust/files", r"MAX_BYTES \+ 2", "one byte too many shows as well that it is too large"),
-    Kept("trust/pipes", r"\* 1001", "a thousandth of the time that is left"),
+    Kept("trust/sight", r"\* 1001", "a thousandth of the time that is left"),
     Kept("trust/terminals", r"TIOCSCTTY, \)", "0 is the argument if none is given, see fcntl"),
     Kept("", r"file=sys\.stderr, flush=False", "Python writes standard error line by line"),
     Kept("decisions/life/table", r"keys\(\) < ", "no state handles all events itself"),

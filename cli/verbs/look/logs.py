@@ -11,7 +11,6 @@ from typing import Any
 
 import click
 
-from dora_systemd.adapters.host.unit_names import has_unit, unit_places
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.colors import is_dumb, wants_colors
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
@@ -29,7 +28,7 @@ from dora_systemd.names import LINK_PREFIX
 from dora_systemd.trust.programs import check_program
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.recorded import find_query, find_soon
-from dora_systemd.verbs.logs import pass_logs, read_logs, write_whole
+from dora_systemd.verbs.logs import has_unit, pass_logs, read_logs, unit_places, write_whole
 
 Lines = TerminalLines | ShownLines | None
 """Formats lines for a terminal; None for a pipe."""

@@ -1,4 +1,7 @@
-"""Connects to systemd by the message bus or its private socket, with a timeout for each."""
+"""Connects to systemd by the message bus or its private socket, with a timeout for each.
+
+encoded() and decoded() convert values to and from the form that pystemd's call_method() uses.
+"""
 
 import _thread
 import os
@@ -9,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.bus.errors import connection_error, silent_bus
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_readable
 from dora_systemd.scope import Scope
 
 SERVICE = b"org.freedesktop.systemd1"
@@ -25,6 +29,8 @@ _BUS_SECONDS = 1.0
 _TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
 """The only way to set the timeout of sd-bus through pystemd: read at a connection's first call."""
 _environment = _thread.allocate_lock()  # threading takes a while to load
+_CLOSE = (-1, None)
+"""pystemd's mark for the end of a container."""
 
 
 def connect(scope: Scope, for_reading: bool) -> Any:
@@ -88,3 +94,51 @@ def _address(scope: Scope) -> str:
 
 def _private_socket(scope: Scope) -> str:
     return str(scope.runtime_root / "systemd" / "private")
+
+
+def encoded(signature: str, value: Any) -> list[tuple[int, Any]]:
+    """`value` as the sequence of basic types and containers for call_method().
+
+    A variant's value is a pair of its signature and its value.
+    """
+    kind = signature[0]
+    if kind == "a":
+        items = [word for one in value for word in encoded(signature[1:], one)]
+        return [(ord("a"), signature[1:].encode()), *items, _CLOSE]
+    if kind == "(":
+        pairs = zip(_split(signature[1:-1]), value, strict=True)
+        items = [word for inner, one in pairs for word in encoded(inner, one)]
+        return [(ord("r"), signature[1:-1].encode()), *items, _CLOSE]
+    if kind == "v":
+        return [(ord("v"), value[0].encode()), *encoded(*value), _CLOSE]
+    return [(ord(kind), _text(value) if kind in "sog" else value)]
+
+
+def _text(value: str) -> bytes:
+    if not is_readable(value):
+        hint = "write it as UTF-8, without NUL and noncharacters"
+        raise DoraSystemdError(f"cannot send {value!r} to systemd", hint, ExitCode.USAGE)
+    return value.encode()
+
+
+def _split(signature: str) -> list[str]:
+    """The complete types of a signature: "sasb" gives s, as, b."""
+    types, current, depth = [], "", 0
+    for char in signature:
+        current += char
+        depth += (char == "(") - (char == ")")
+        if char != "a" and depth == 0:
+            types.append(current)
+            current = ""
+    return types
+
+
+def decoded(value: Any) -> Any:
+    """The body of a message of pystemd, with str for bytes and lists for tuples."""
+    if isinstance(value, bytes):
+        return os.fsdecode(value)
+    if isinstance(value, dict):
+        return {decoded(key): decoded(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [decoded(one) for one in value]
+    return value

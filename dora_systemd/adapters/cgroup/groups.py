@@ -9,10 +9,11 @@ import errno
 import io
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from itertools import islice
 from pathlib import Path
+from signal import Signals, pidfd_send_signal
 
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -303,3 +304,26 @@ def _resident_bytes(pid: int) -> int:
     """The resident set in bytes: the second number of /proc/PID/statm, see proc_pid_statm(5)."""
     numbers = read_text(f"/proc/{pid}/statm").split()
     return int(numbers[1]) * os.sysconf("SC_PAGE_SIZE") if len(numbers) > 1 else 0
+
+
+def is_member(path: Path, pid: int, find: Callable[[int], str] = group_of) -> bool:
+    """Whether the process is in the group at `path`, or in one below it. find: gives its group."""
+    return group_path(find(pid)).is_relative_to(path)
+
+
+def signal_group(
+    path: Path, number: Signals, first: int, is_in: Callable[[Path, int], bool] = is_member
+) -> None:
+    """Send a signal to all processes of the group and below it, to process `first` before others.
+
+    A process that leaves the group meanwhile, or takes over a pid, gets none. is_in: whether a
+    process is in a group.
+    """
+    for pid in sorted(pids(path), key=lambda pid: pid != first):
+        with contextlib.suppress(OSError):
+            pidfd = os.pidfd_open(pid)
+            try:
+                if is_in(path, pid):
+                    pidfd_send_signal(pidfd, number)
+            finally:
+                os.close(pidfd)

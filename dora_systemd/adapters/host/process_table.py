@@ -1,4 +1,4 @@
-"""The processes of this machine and whose sockets are whose, from proc(5).
+"""The processes of this machine, and who holds which sockets and locks, from proc(5).
 
 Only root sees all details of other users' processes. Every entry may be out of date at once.
 """
@@ -6,8 +6,11 @@ Only root sees all details of other users' processes. Every entry may be out of 
 import contextlib
 import os
 import re
-from collections.abc import Collection
+from collections import defaultdict
+from collections.abc import Collection, Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.decisions.views.diagnosis import Process
 
@@ -15,6 +18,10 @@ PROC = Path("/proc")
 
 _MOST_BYTES = 256 * 1024
 _SOCKET = re.compile(r"socket:\[(\d+)\]")
+_MOST_OF_LOCKS = 8 * 1024 * 1024
+"""Of /proc/locks: 100,000 locks."""
+_MOST_OF_PROCESS = 4096
+_FLOCK = re.compile(rb"\d+: FLOCK +\S+ +(?:READ|WRITE) +(\d+) ([0-9a-f]+:[0-9a-f]+):(\d+) ")
 
 
 def read_processes(proc: Path = PROC) -> list[Process]:
@@ -75,3 +82,42 @@ def _holds(directory: Path, inodes: Collection[int]) -> bool:
                 if match and int(match[1]) in inodes:
                     return True
     return False
+
+
+class LockProcess(NamedTuple):
+    """A process. uid: its effective user. inner_pid: in its own PID namespace. group: cgroup."""
+
+    pid: int
+    uid: int
+    inner_pid: int
+    command: str
+    group: str
+
+
+def read_flocks(device: int) -> Mapping[int, tuple[int, ...]]:
+    """The processes with a flock(2) on files of a device (st_dev), by inode, see proc_locks(5).
+
+    A lock whose owner is in a PID namespace that the caller does not see is missing. Empty if the
+    kernel does not tell.
+    """
+    wanted = b"%02x:%02x" % (os.major(device), os.minor(device))
+    found: defaultdict[int, tuple[int, ...]] = defaultdict(tuple)
+    with suppress(OSError), (PROC / "locks").open("rb") as file:
+        for match in map(_FLOCK.match, file.read(_MOST_OF_LOCKS).split(b"\n")):
+            if match and match[2] == wanted:
+                found[int(match[3])] += (int(match[1]),)
+    return found
+
+
+def read_lock_process(pid: int) -> LockProcess:
+    """What the kernel knows of a process; for one that has gone, its pid only. uid: -1 then."""
+    path = PROC / str(pid)
+    with suppress(OSError, ValueError, KeyError, IndexError):
+        read = (beginning(path / one, _MOST_OF_PROCESS) for one in ("cmdline", "cgroup", "status"))
+        arguments, groups, rest = read
+        command = arguments.decode(errors="replace").replace("\0", " ").strip()
+        lines = (line.partition(":") for line in rest.decode(errors="replace").split("\n"))
+        status = {key: text.split() for key, _, text in lines}
+        uid, inner = int(status["Uid"][1]), int(status["NSpid"][-1])
+        return LockProcess(pid, uid, inner, command, group_in(groups))
+    return LockProcess(pid, -1, pid, "", "")

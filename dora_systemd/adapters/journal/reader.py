@@ -4,7 +4,7 @@ import json
 import os
 import select
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice, takewhile
 from math import inf
@@ -20,6 +20,7 @@ from dora_systemd.adapters.journal.journalctl import (
 )
 from dora_systemd.decisions.cell.exits import KILLED
 from dora_systemd.decisions.logs.query import (
+    failure_matches,
     journal_timestamp,
     scope_matches,
     start_matches,
@@ -43,6 +44,7 @@ MAX_LINE = 1024 * 1024
 _MOST_FORGED = 100
 _MOST_NAMES = 1000
 _MOST_DETAIL = 300
+_MOST_RECORDS = 1000
 
 
 @dataclass(frozen=True)
@@ -307,3 +309,35 @@ def check_readable(scope: Scope, root: Path | None = None) -> None:
         hint = f"it is volatile: {JOIN}, or have Storage=persistent set in journald.conf(5)"
         message = "cannot read the records of user services in this machine's journal"
         raise DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
+
+
+def later_failures(events: Sequence[LastEvent]) -> dict[str, int]:
+    """By UUID, when the unit of a dataflow has failed after its event, CLOCK_REALTIME µs.
+
+    From systemd's own records: our code may not have run any more to record a failure. Only the
+    system's manager records whose failure it is, see LogExtraFields= in systemd.exec(5). Raises
+    DoraSystemdError.
+    """
+    known = {event.uuid: event for event in events}
+    found: dict[str, int] = {}
+    for record in JournalReader().newest(failure_matches(list(known)), _MOST_RECORDS):
+        event = known.get(str(record.get("DORA_DATAFLOW", "")))
+        if event and record.get("UNIT") == unit_name(event.name) and _is_after(record, event):
+            found.setdefault(event.uuid, int(record["__REALTIME_TIMESTAMP"]))
+    return found
+
+
+def _is_after(record: Mapping[str, Any], event: LastEvent) -> bool:
+    """By the order in the journal: the clock may have been set back in between."""
+    source, number = _place(str(record.get("__CURSOR", "")))
+    own_source, own_number = _place(event.cursor)
+    if source and source == own_source:
+        return number > own_number
+    return int(record["__REALTIME_TIMESTAMP"]) > event.at_us
+
+
+def _place(cursor: str) -> tuple[str, int]:
+    """Of a record, see "Cursor" in the Journal Export Formats: by whom it is counted, and its
+    number."""
+    fields = dict(part.partition("=")[::2] for part in cursor.split(";"))
+    return fields.get("s", ""), int(fields.get("i", "0"), 16)

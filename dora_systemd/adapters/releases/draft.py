@@ -8,7 +8,7 @@ import ctypes
 import errno
 import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from dora_systemd.adapters.releases.store import (
@@ -26,6 +26,8 @@ from dora_systemd.trust.paths import sync_directory
 _CHUNK = 256 * 1024
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LIBC = ctypes.CDLL(None, use_errno=True)
+_LEAST_SHARE = 20
+"""The build has to leave one part in so many of the file system free."""
 
 
 class Draft:
@@ -150,3 +152,45 @@ def _sync_file_system(path: Path) -> None:
             raise OSError(number, os.strerror(number), str(path))
     finally:
         os.close(fd)
+
+
+class BuildTree(Draft):
+    """The tree in which a release is built: a copy of the project that the nodes' user may change.
+
+    The directory above it is root's alone, so nobody reaches the tree by a path but the unit of the
+    build, which sees it where the release will be. Its files are no hard links: the inodes of other
+    releases would become that user's. All of it is hostile once it is handed over. All methods
+    raise OSError.
+    """
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store, "build")
+        self._least = tuple(
+            min(total // _LEAST_SHARE, free // 2) for total, free in _room(self._tree)
+        )
+
+    def hand_over(self, files: Mapping[str, Stored], owner: tuple[int, int] | None) -> None:
+        """Let the nodes' user write all of it.
+
+        files: that were copied. owner: uid and gid of that user, None for the caller.
+        """
+        for path, one in files.items():
+            if not one.target:
+                (self._tree / path).chmod(0o755 if one.is_executable else 0o644)
+        for place in (*(self._tree / path for path in files), *self._made):
+            if owner is not None:
+                os.chown(place, *owner, follow_symlinks=False)
+        self._tree.chmod(0o700)
+
+    def is_disk_full(self) -> bool:
+        """Whether the build has taken more of the file system than it may."""
+        return any(
+            free < least for (_, free), least in zip(_room(self._path), self._least, strict=True)
+        )
+
+
+def _room(path: Path) -> list[tuple[int, int]]:
+    """The bytes and the inodes of a file system: all, and those that are free."""
+    found = os.statvfs(path)
+    bytes_ = (found.f_blocks * found.f_frsize, found.f_bavail * found.f_frsize)
+    return [bytes_, (found.f_files, found.f_favail)]

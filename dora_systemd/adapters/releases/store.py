@@ -25,8 +25,7 @@ from dora_systemd.decisions.releases.past import (
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import STORE, TREE, is_release_id
-from dora_systemd.trust.files import MAX_BYTES, read_file
-from dora_systemd.trust.lines import append_lines, read_lines
+from dora_systemd.trust.files import MAX_BYTES, append_lines, read_file, read_lines
 from dora_systemd.trust.paths import sync_directory
 from dora_systemd.trust.programs import spawn
 from dora_systemd.values import shown

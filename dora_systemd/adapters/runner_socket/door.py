@@ -4,23 +4,43 @@ A link needs nothing but the ports to log in, and that takes longer than all imp
 comes is kept for listener.py. Imports only what loads quickly.
 """
 
+import contextlib
 import os
 import select
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from typing import NamedTuple
 
-from dora_systemd.adapters.runner_socket.address import listen
-
 _SECONDS = 0.5
 """For a request: only the user of the nodes and root can connect."""
 _CHUNK = 1 << 16
-
 Greet = Callable[[bytes], tuple[bytes, bytes]]
 """What to answer to a line, b"" for nothing yet, and what is to be taken for that line later."""
+
+
+def listen(path: Path) -> socket.socket:
+    """A listener at `path` for its user alone. Raises OSError."""
+    path.unlink(missing_ok=True)
+    with _short(path) as address, contextlib.ExitStack() as undo:
+        listener = undo.enter_context(socket.socket(socket.AF_UNIX))
+        listener.bind(address)
+        path.chmod(0o600)
+        listener.listen()
+        undo.pop_all()
+        return listener
+
+
+@contextlib.contextmanager
+def _short(path: Path) -> Iterator[str]:
+    """A short path for the socket: an address has 107 bytes, see unix(7), and a name up to 200."""
+    directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{directory}/{path.name}"
+    finally:
+        os.close(directory)
 
 
 class Kept(NamedTuple):

@@ -8,21 +8,18 @@ import contextlib
 import json
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from dora_systemd.adapters.runner_socket.address import listen
 from dora_systemd.adapters.runner_socket.client import (
     MAX_BYTES,
     Request,
     error_reply,
     parse_line,
 )
+from dora_systemd.adapters.runner_socket.door import Door, listen
 from dora_systemd.adapters.runner_socket.splice import Ends, Writer, splice, taken_over
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
-
-if TYPE_CHECKING:  # most dataflows run on one machine
-    from dora_systemd.adapters.runner_socket.door import Door
 
 Answer = Callable[[Request], Awaitable[dict[str, Any]]]
 Session = Callable[[Request, Ends], Coroutine[Any, Any, None]]
@@ -40,7 +37,7 @@ async def serve(
     answer: Answer,
     reach: Reach,
     sessions: Mapping[str, Session] | None = None,
-    door: "Door | None" = None,
+    door: Door | None = None,
 ) -> None:
     """Answer requests at `path` forever. An error is {"error": ..., "hint": ..., "code": ...}.
 

@@ -14,8 +14,7 @@ from pathlib import Path
 from signal import SIGABRT, Signals
 from typing import Protocol
 
-from dora_systemd.adapters.cgroup.groups import NODE_PREFIX, kill_group
-from dora_systemd.adapters.cgroup.members import is_member, signal_group
+from dora_systemd.adapters.cgroup.groups import NODE_PREFIX, is_member, kill_group, signal_group
 from dora_systemd.adapters.host.notify_socket import NotifySocket, Pending
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus

@@ -6,8 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.journal.failures import later_failures
-from dora_systemd.adapters.journal.reader import JournalReader, LastEvent, is_volatile
+from dora_systemd.adapters.journal.reader import (
+    JournalReader,
+    LastEvent,
+    is_volatile,
+    later_failures,
+)
 from dora_systemd.decisions.life.causes import NO_END
 from dora_systemd.decisions.logs.events import FORGOTTEN
 from dora_systemd.decisions.logs.query import request_matches

@@ -4,7 +4,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from dora_systemd.adapters.host.lock_table import LockProcess, read_flocks, read_lock_process
+from dora_systemd.adapters.host.process_table import LockProcess, read_flocks, read_lock_process
 from dora_systemd.decisions.cell.inhibit import parse_reasons
 from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.errors import DoraSystemdError

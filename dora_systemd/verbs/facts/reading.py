@@ -17,7 +17,7 @@ from dora_systemd.decisions.views.dataflows import FROZEN
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
-from dora_systemd.trust.cells import read_table, read_times
+from dora_systemd.trust.files import read_table, read_times
 from dora_systemd.verbs.facts.cells import Cell
 
 if TYPE_CHECKING:  # the table of `list` does without

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.host.addresses import port_error
 from dora_systemd.adapters.host.process import read_child
-from dora_systemd.adapters.ssh.program import start_ssh
+from dora_systemd.adapters.ssh import start_ssh
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.machines.facts import Facts, parse_facts
 from dora_systemd.decisions.machines.link_command import LinkOptions, ssh_link_arguments

@@ -15,7 +15,7 @@ from pathlib import Path, PurePath
 from signal import SIGKILL
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager, Property, is_at_rest
-from dora_systemd.adapters.releases.build_tree import BuildTree
+from dora_systemd.adapters.releases.draft import BuildTree
 from dora_systemd.adapters.releases.store import Store, remove_tree
 from dora_systemd.decisions.cell.options import build_command
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE

@@ -1,21 +1,27 @@
 """Checks that this machine can enforce the limits of a dataflow."""
 
+import os
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.host.machine import read_machine
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, has_cpus, without_cpus
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.settings.limit_checks import (
+    Machine,
     check_controllers,
     check_cpus,
     needed_controllers,
     size_warnings,
 )
 from dora_systemd.decisions.settings.limits import DEVICE, NICE
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.values import cpu_numbers, parse_cpus
 from dora_systemd.verbs.start.plan import Plan
+
+_KIB = 1024
+_ONLINE = Path("/sys/devices/system/cpu/online")
 
 
 def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[str, ...]:
@@ -70,3 +76,19 @@ def _missing_devices(plan: Plan) -> list[str]:
         for path in paths
         if path.startswith("/") and not Path(path).exists()
     ]
+
+
+def read_machine() -> Machine:
+    """Bytes of memory, number of processors and maximum tasks. Raises OSError without /proc."""
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    total = next(int(line.split()[1]) for line in lines if line.startswith("MemTotal:"))
+    tasks = int(Path("/proc/sys/kernel/pid_max").read_text())
+    return Machine(total * _KIB, os.cpu_count() or 1, tasks, _online())
+
+
+def _online() -> frozenset[int] | None:
+    """The online CPUs, see sysfs's cpu/online in the kernel's cputopology document."""
+    try:
+        return frozenset(cpu_numbers(parse_cpus(_ONLINE.read_text())))
+    except (OSError, DoraSystemdError):
+        return None

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from dora_systemd.adapters.bus import connection
 from dora_systemd.adapters.bus import errors as bus_errors
 from dora_systemd.adapters.bus import systemd as bus
+from dora_systemd.adapters.bus.connection import decoded, encoded
 from dora_systemd.adapters.bus.manager import Observer
-from dora_systemd.adapters.bus.wire import decoded, encoded
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import fake_systemd

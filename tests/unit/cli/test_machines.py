@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.host.unit_names import has_unit, unit_places
 from dora_systemd.cli.remote import machines
 from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.verbs.look.logs import command
@@ -14,6 +13,7 @@ from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import LINK_PREFIX
 from dora_systemd.scope import scope_of
+from dora_systemd.verbs.logs import has_unit, unit_places
 from tests.unit.fakes.library import fake_systemd
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.verbs.facts.test_machines import WORDS

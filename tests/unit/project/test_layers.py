@@ -260,7 +260,7 @@ STARTS_PROGRAMS = {
     "trust.programs": "for others",
     "adapters.dora.engine": "dora's, in a cell",
     "adapters.journal.journalctl": "journalctl",
-    "adapters.ssh.program": "ssh, as the caller",
+    "adapters.ssh": "ssh, as the caller",
     "link.program": "ssh, as the caller of doractl start",
     "verbs.machines.member": "itself, as a smaller program",
     "adapters.host.guard": "itself, without another program",

@@ -46,30 +46,29 @@ OTHERWISE = (
 
 _TABLE = {
     DOOR: """
-        trust.courier trust.eyes trust.lines trust.locks trust.paths trust.project trust.programs
+        trust.courier trust.eyes trust.files trust.locks trust.paths trust.project trust.programs
         trust.sight trust.sockets trust.terminals trust.tree
     """,
     OWN: """
-        adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
+        adapters.dora.preparation adapters.host.files adapters.ssh cli.main
         cli.edge cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold
         verbs.machines.member verbs.machines.push verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
-        adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
+        adapters.cgroup.groups
         adapters.host.process_table adapters.host.real_time adapters.host.rights
         runner.cell.restarts trust.socket_table verbs.destroy
         link.relay verbs.facts.lives verbs.start.sandbox
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
-        adapters.host.unit_names
         adapters.host.guard
-        adapters.releases.build_tree adapters.releases.draft adapters.releases.incoming
+        adapters.releases.draft adapters.releases.incoming
         adapters.releases.store verbs.releases.source verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
         verbs.machines.register
-        verbs.setup verbs.show verbs.start.enable verbs.up
+        verbs.logs verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """
         cli.group gateway.page
@@ -78,7 +77,7 @@ _TABLE = {
         adapters.dora.check adapters.dora.engine adapters.dora.websocket adapters.host.fd_store
         adapters.host.notify_socket adapters.host.shared_times
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
-        adapters.runner_socket.address
+        adapters.runner_socket.door
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
         runner.cell.restarts runner.machines.boot
         adapters.host.presence runner.requests runner.needs runner.nodes.launcher_gates

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.journal.journalctl import journal_output
-from dora_systemd.adapters.ssh.program import run_on_terminal, start_here, start_ssh
+from dora_systemd.adapters.ssh import run_on_terminal, start_here, start_ssh
 from dora_systemd.cli.verbs.look.logs import print_paged
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.machines.push import place_problem

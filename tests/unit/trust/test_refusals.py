@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.files import MAX_BYTES, read_file, read_own_file
-from dora_systemd.trust.lines import append_lines
+from dora_systemd.trust.files import MAX_BYTES, append_lines, read_file, read_own_file
 from dora_systemd.trust.locks import open_lock
 from dora_systemd.trust.paths import list_directory, reached
 from dora_systemd.trust.programs import check_program, own_account

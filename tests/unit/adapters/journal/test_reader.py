@@ -3,16 +3,30 @@
 import json
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.journal.reader import Bounds, JournalReader, check_readable
+from dora_systemd.adapters.journal.reader import (
+    Bounds,
+    JournalReader,
+    LastEvent,
+    check_readable,
+    later_failures,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from tests.unit.fakes.library import fake_journalctl
+from tests.unit.fakes.manager import UUID
 from tests.unit.fakes.programs import make_program
 
 SYSTEM = Scope(is_user=False, uid=0)
 USER = Scope(is_user=True, uid=1000)
+READY = '{"DORA_NODE":"a","DORA_EVENT":"node-ready"}'
+ANY = '{"MESSAGE":"x"}'
+ENDED = "550e8400-e29b-41d4-a716-446655440000"
+OTHER = ENDED[:-1] + "1"
+STOPPED = LastEvent("robot", ENDED, "dataflow-stopped", 20, "", "s=aa;i=1f;b=bb")
 
 
 @pytest.fixture
@@ -81,10 +95,6 @@ def play_fields(script: Path, fields: dict[str, list[str]], records: dict[str, s
     make_program(
         script, f"""echo "$*" >>'{script}.asked'; case "$*" in\n""" + "\n".join(cases) + "\nesac"
     )
-
-
-READY = '{"DORA_NODE":"a","DORA_EVENT":"node-ready"}'
-ANY = '{"MESSAGE":"x"}'
 
 
 def test_nodes(journalctl: Path) -> None:
@@ -218,12 +228,9 @@ def test_unreadable(
     assert word in caught.value.hint
 
 
-UUID = "550e8400-e29b-41d4-a716-446655440000"
-
-
 def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
     """A node can write any field; the unit that it wrote it in is journald's word."""
-    own = {"DORA_DATAFLOW": UUID, "DORA_EVENT": "dataflow-failed", "__REALTIME_TIMESTAMP": "9"}
+    own = {"DORA_DATAFLOW": ENDED, "DORA_EVENT": "dataflow-failed", "__REALTIME_TIMESTAMP": "9"}
     good = {**own, "DORA_DATAFLOW_NAME": "a", "_SYSTEMD_UNIT": "dora-a.service"}
     bad: list[dict[str, object]] = [
         {**own, "DORA_DATAFLOW_NAME": "b", "_SYSTEMD_UNIT": "dora-a.service"},
@@ -238,8 +245,8 @@ def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
     lines = "\n".join(map(json.dumps, [*bad, good]))
     make_program(journalctl, f"cat <<'E'\n{lines}\nE")
     (event,) = JournalReader().last_events(SYSTEM)
-    assert (event.name, event.uuid) == ("a", UUID)
-    assert JournalReader().name_of(SYSTEM, UUID) == "a"
+    assert (event.name, event.uuid) == ("a", ENDED)
+    assert JournalReader().name_of(SYSTEM, ENDED) == "a"
 
 
 def test_an_endless_journal_has_an_end(journalctl: Path) -> None:
@@ -260,8 +267,8 @@ def test_a_record_that_is_too_long_is_left_out(journalctl: Path) -> None:
 
 
 def test_values_that_can_be_no_uuids(journalctl: Path) -> None:
-    make_program(journalctl, f"printf '%s\\n' robot ../x '\x1b]0;x' 'a b' {UUID}")
-    assert JournalReader().known_uuids() == [UUID]
+    make_program(journalctl, f"printf '%s\\n' robot ../x '\x1b]0;x' 'a b' {ENDED}")
+    assert JournalReader().known_uuids() == [ENDED]
 
 
 def test_a_complaint_of_a_journal_that_is_read_to_a_bound_is_none(journalctl: Path) -> None:
@@ -274,3 +281,35 @@ def test_a_complaint_of_a_journal_that_shows_nothing_is_told(journalctl: Path) -
     make_program(journalctl, "echo 'Failed to wait: x' >&2; exec sleep 1000")
     with pytest.raises(DoraSystemdError, match=r"^cannot read the journal: Failed to wait: x$"):
         JournalReader(Bounds(first_seconds=2.0)).unique("X")
+
+
+def record(at_us: int, cursor: str = "", uuid: str = ENDED, **more: Any) -> dict[str, Any]:
+    """One of systemd."""
+    own = {"DORA_DATAFLOW": uuid, "UNIT": "dora-robot.service"}
+    return {**own, "__REALTIME_TIMESTAMP": str(at_us), "__CURSOR": cursor, **more}
+
+
+@pytest.mark.parametrize(
+    "found, expected",
+    [
+        ([record(30), record(25)], {ENDED: 30}),
+        ([record(10)], {}),
+        ([record(30, uuid=OTHER)], {}),
+        ([record(30, UNIT="other.service")], {}),
+        ([record(30, DORA_DATAFLOW=[ENDED, OTHER])], {}),
+        pytest.param([record(30, "s=aa;i=1e;b=bb")], {}, id="the clock was set back"),
+        pytest.param([record(10, "s=aa;i=20;b=bb")], {ENDED: 10}, id="the clock was set forward"),
+        pytest.param([record(30, "s=cc;i=1;b=bb")], {ENDED: 30}, id="another journald"),
+    ],
+)
+def test_failures(
+    found: list[dict[str, Any]],
+    expected: dict[str, int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = fake_journalctl(monkeypatch, tmp_path, found)
+    assert later_failures([STOPPED]) == expected
+    (asked,) = calls.read_text().splitlines()
+    failed = "MESSAGE_ID=d9b373ed55a64feb8242e02dbe79a49c"
+    assert asked.endswith(f" -- _PID=1 {failed} DORA_DATAFLOW={ENDED}")

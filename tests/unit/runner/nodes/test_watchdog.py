@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.cgroup.members import is_member, signal_group
+from dora_systemd.adapters.cgroup.groups import is_member, signal_group
 from dora_systemd.adapters.host import notify_socket
 from dora_systemd.adapters.host.notify_socket import NotifySocket
 from dora_systemd.adapters.journal.socket import JournalSocket

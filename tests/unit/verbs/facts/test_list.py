@@ -19,7 +19,7 @@ from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.top import Look, TopEntry, format_top
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.trust.cells import MAX_TABLE, read_table
+from dora_systemd.trust.files import MAX_TABLE, read_table
 from dora_systemd.verbs import why
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import dataflow_row, read_rows, table_rows

@@ -13,7 +13,7 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.decisions.views.facts import OutputRow
 from dora_systemd.scope import Scope
-from dora_systemd.trust.cells import read_times
+from dora_systemd.trust.files import read_times
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import dataflow_row
