@@ -115,7 +115,8 @@ def test_garbage_ends_nothing() -> None:
     async def story(browser: Browser) -> None:
         for text in ("", "[]", '{"type": "x"}'):
             browser.inbox.put_nowait(text)
-        await browser.wait_for("problem", 3)
+        problems = await browser.wait_for("problem", 3)
+        assert {one["text"] for one in problems} == {"cannot read what the page sent"}
         await browser.wait_for("snapshot", len(browser.got) + 2)
 
     play(story)
@@ -224,6 +225,8 @@ def test_a_page_that_takes_nothing_is_given_up() -> None:
         browser = Browser()
         browser.is_stuck = True
         await within(60, talk(browser, REQUEST, Means(send_seconds=0.05)))
+        assert len(asyncio.all_tasks()) == 1
+        assert not browser.got
 
     asyncio.run(both())
 

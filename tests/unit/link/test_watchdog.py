@@ -26,4 +26,7 @@ def test_each_turn_feeds_it_once_a_second(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_without_systemd_it_does_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    made: list[object] = []
+    monkeypatch.setattr(socket, "socket", made.append)
     Watchdog().feed()
+    assert not made

@@ -135,7 +135,7 @@ def test_only_systemd_starts_runners_and_gateways(name: str) -> None:
 
 def test_no_module_imports_in_a_circle() -> None:
     graph = {name: imports(name)[0] & PATHS.keys() for name in PATHS}
-    list(graphlib.TopologicalSorter(graph).static_order())
+    assert {*graphlib.TopologicalSorter(graph).static_order()} == PATHS.keys()
 
 
 def test_no_folder_imports_in_a_circle() -> None:
@@ -144,7 +144,7 @@ def test_no_folder_imports_in_a_circle() -> None:
         graph[folder_of(name)] |= {folder_of(target) for target in imports(name)[0]}
     for folder, targets in graph.items():
         targets.discard(folder)
-    list(graphlib.TopologicalSorter(graph).static_order())
+    assert {*graphlib.TopologicalSorter(graph).static_order()} >= graph.keys()
 
 
 def things_in(folder: Path) -> list[Path]:

@@ -125,6 +125,8 @@ def test_a_file_system_without_locks(
 
 def test_force(scope: ScopeIn, cell: Cell, lock: Path) -> None:
     with locked(lock):
+        with pytest.raises(DoraSystemdError, match="cannot restart robot: inhibited"):
+            require_uninhibited(scope, [cell], "restart")
         require_uninhibited(scope, [cell], "restart", IfInhibited.FORCE)
 
 
@@ -149,14 +151,17 @@ def test_who_waits_keeps_nobody_from_a_lock(scope: ScopeIn, manager: FakeManager
         paths[-1].parent.mkdir(parents=True)
         make_lock(paths[-1])
 
-    def told(_text: str) -> None:
+    said: list[str] = []
+
+    def told(text: str) -> None:
         with locked(paths[0]):
-            pass
+            said.append(text)
         file.close()
 
     file = paths[1].open("a")
     fcntl.flock(file, fcntl.LOCK_SH)
     require_uninhibited(scope, read_cells(manager), "restart", IfInhibited.WAIT, told)
+    assert [text.partition(":")[0] for text in said] == ["cannot restart b"]
 
 
 def test_a_lock_ends_with_its_process(scope: ScopeIn, cell: Cell, lock: Path) -> None:

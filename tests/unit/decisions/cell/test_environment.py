@@ -121,8 +121,7 @@ def test_any_file_is_read_or_refused(text: str) -> None:
         variables = parse_environment_file(text, "x.env")
     except DoraSystemdError:
         return
-    for entry in environment_entries(variables):
-        parse_assignment(entry)
+    assert dict(map(parse_assignment, environment_entries(variables))) == variables
 
 
 def test_what_a_prompt_has_and_systemd_does_not_set() -> None:

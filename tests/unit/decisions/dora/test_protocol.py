@@ -119,9 +119,11 @@ json_values = st.recursive(
 def test_no_frame_breaks_the_parser(text: str) -> None:
     frame = protocol.parse_frame(text)
     if isinstance(frame, LogRecord):
-        life_events.parse_life_event(frame, 1)
+        event = life_events.parse_life_event(frame, 1)
+        assert event is None or event.at_us == 1
     if isinstance(frame, Reply):
-        protocol.parse_results(frame)
+        results = protocol.parse_results(frame)
+        assert results is None or {*map(type, results.values())} <= {Exit}
 
 
 @given(
