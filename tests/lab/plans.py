@@ -21,6 +21,8 @@ from lab.venv import add_package, ensure_venv, venv_environment, write_package
 
 LAB_PYTHON = (3, 13)
 MUTMUT = "mutmut==3.8.1"
+# xdist would name its processes with it, and some tests look at their own command line.
+NOT_WITH_MUTMUT = "setproctitle"
 FAULTS = "tests/system/faults"
 # Containers at the same time. Most of the time of a test is waiting, and one more than three makes
 # two cores so busy that the tests wait for each other.
@@ -222,7 +224,7 @@ def plan_mutants(_form: str) -> list[Step]:
 
 def in_venv_with_mutmut() -> dict[str, str]:
     venv = ensure_venv(find_cache())
-    add_package(venv, MUTMUT)
+    add_package(venv, MUTMUT, NOT_WITH_MUTMUT)
     return venv_environment(venv)
 
 

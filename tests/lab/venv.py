@@ -61,13 +61,18 @@ def build_venv(venv: Path, packages: list[str], log: Path) -> None:
         (venv / "finished").touch()
 
 
-def add_package(venv: Path, package: str) -> None:
-    """Install what only one target needs, unless it is there."""
-    note = venv / f"with-{package}"
+def add_package(venv: Path, package: str, without: str) -> None:
+    """Install what only one target needs, unless it is there.
+
+    without: a package that it needs for something else, and that would change the other targets.
+    """
+    note = venv / f"with-{package}-without-{without}"
     if not note.exists():
+        pip = [str(venv / "bin/python"), "-m", "pip"]
         with Stage(f"{package} from PyPI into {venv}"):
-            pip = [str(venv / "bin/python"), "-m", "pip", "install", package]
-            run_logged(pip, venv / "more.log", f"install {package}")
+            run_logged([*pip, "install", package], venv / "more.log", f"install {package}")
+            remove = [*pip, "uninstall", "--yes", without]
+            run_logged(remove, venv / "more.log", f"remove {without}")
             note.touch()
 
 

@@ -3,6 +3,7 @@
 import os
 import socket
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from dora_systemd.trust.socket_table import listening_sockets
 def test_ourselves() -> None:
     (own,) = [one for one in read_processes() if one.pid == os.getpid()]
     assert own.parent == os.getppid()
+    assert Path(own.command[0]).name == Path(sys.executable).name
     assert not own.is_node
 
 
