@@ -41,7 +41,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def parse_arguments(arguments: Sequence[str]) -> float:
     """The idle time in seconds after which the gateway exits."""
-    parser = argparse.ArgumentParser("dora-gateway", description="see dora-systemd(7)")
+    parser = argparse.ArgumentParser("dora-gateway", description="see dora-systemd-security(7)")
     parser.add_argument("--exit-idle-time", default="60s", metavar="DURATION")
     given = parser.parse_args(arguments).exit_idle_time
     return parse_duration(given) / SECOND

@@ -17,7 +17,7 @@ from tests.system.shells import SHELLS
 
 USERS = ("root", "alice")
 ALICE = "XDG_RUNTIME_DIR=/run/user/$(id -u)"
-MANUALS = ("doractl.1", "dora-systemd.yml.5", "dora-systemd.7", "dora-systemd-json.7", "dora.1")
+MANUALS = (*sorted(path.name for path in (packages.CHECKOUT / "packaging/man").iterdir()), "dora.1")
 OLD_MODULES = {
     "dora_systemd.runner.stop_post": "dora_systemd.runnerpost",
     "dora_systemd.runner.reload.request": "dora_systemd.runnerask",

@@ -26,7 +26,7 @@ _HEADING = """# Several machines, as seen
 
 Written by `python -m tests.machines.show` in the lab `LAB=machines`: three containers with Debian
 13, systemd, dora and sshd, named a, b and c, on one network. The dataflow is that of the tests:
-`source` runs on a, `doubler` on b, and `sink` on a or c. See SEVERAL MACHINES in dora-systemd(7).
+`source` runs on a, `doubler` on b, and `sink` on a or c. See dora-systemd-machines(7).
 
 ## A life, and a pulled cable
 

@@ -16,7 +16,7 @@ from tests.system.refusals import Refusal, check_refusals
 ON_FAILURE = ("--restart-policy", "on-failure", "--max-restarts", "3")
 ENDED = ("is ended by its watchdog", "was ended", "is being restarted", "node exited with error")
 
-# As in dora-systemd(7), without a library.
+# As in dora-systemd-nodes(7), without a library.
 SAY = """
 import os, socket
 def say(text, place=os.environ["NOTIFY_SOCKET"]):

@@ -21,7 +21,7 @@ def command(selector: str, node: str | None, force: bool, wait: bool) -> int:
 
     Like hot reload when a file is saved: only the affected nodes restart, and a change that cannot
     be used has no effect. Refused while doractl inhibit or a node inhibits it. See HOT RELOAD in
-    dora-systemd(7).
+    dora-systemd-nodes(7).
 
     Examples:
       doractl reload robot

@@ -37,8 +37,8 @@ _HEADER = ("NAME", "HOST", "KEY")
 def command() -> None:
     """Add, list, check or remove machines of dataflows that run on several.
 
-    A machine that was added can be named in deploy.machine of any dataflow, see SEVERAL MACHINES in
-    dora-systemd(7).
+    A machine that was added can be named in deploy.machine of any dataflow, see
+    dora-systemd-machines(7).
 
     Examples:
       doractl machine add alice@gpu-box --name gpu

@@ -129,7 +129,7 @@ def command(
     """Run the nodes of FILE that belong to this machine, as the service dora-NAME.service.
 
     Only the link of a head calls this, by ssh: it says where the coordinator is, and the nodes end
-    when it is gone. See SEVERAL MACHINES in dora-systemd(7).
+    when it is gone. See dora-systemd-machines(7).
 
     Examples:
       doractl member flow.yml --name robot --uuid UUID --as gpu --placed yolo=gpu

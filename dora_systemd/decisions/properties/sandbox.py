@@ -1,7 +1,7 @@
 """The sandbox of a dataflow: turns a level and a few options into unit properties.
 
 Every property is one of systemd.exec(5) or systemd.resource-control(5). The table SANDBOX of
-dora-systemd(7) lists what each of them restricts.
+dora-systemd-security(7) lists what each of them restricts.
 
 systemd mounts as root, at every start and restart. BindPaths= follows links, and ReadWritePaths= is
 a mount too, with a delay between check and mount. A link in a directory of the nodes' user could

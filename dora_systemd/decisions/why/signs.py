@@ -4,7 +4,7 @@ import re
 import shlex
 from collections.abc import Iterable, Sequence
 
-_MORE = "see SANDBOX in dora-systemd(7)"
+_MORE = "see dora-systemd-security(7)"
 _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
     (
         ("No module named 'dora'",),

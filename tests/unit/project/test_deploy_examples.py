@@ -37,4 +37,4 @@ def test_who_does_what() -> None:
     assert (PLACE / "post-receive").stat().st_mode & 0o111
     assert JOB["jobs"]["deploy"]["steps"][0]["with"] == {"persist-credentials": False}
     assert "root@" not in HOOK + "".join(STEPS)
-    assert "examples/deploy" in sections("dora-systemd.7")["RELEASES"]
+    assert "examples/deploy" in sections("dora-systemd-releases.7")["EXAMPLES"]

@@ -120,9 +120,7 @@ def test_exit_statuses() -> None:
 
 
 def test_exit_statuses_of_the_unit() -> None:
-    """All are in one paragraph, which says what each means."""
-    text = (MAN / "dora-systemd.7").read_text().partition("The exit status of the runner, ")[2]
-    listed = re.findall(r"\b(\d+)\b", text.partition(".Pp")[0])
+    listed = re.findall(r"^\.It (\d+)$", sections("dora-systemd.7")["EXIT STATUS"], flags=re.M)
     assert [int(number) for number in listed] == [int(code) for code in RunnerExit]
     run = sections("doractl.1")["EXIT STATUS"].partition("ends with the exit status of the")[2]
     assert str(int(RunnerExit.ENGINE_LOST)) in run
@@ -190,7 +188,7 @@ def test_events() -> None:
 
 
 def events_text() -> str:
-    return sections("dora-systemd.7")["LIFE EVENTS"]
+    return sections("dora-systemd-logs.7")["LIFE EVENTS"]
 
 
 def test_files() -> None:

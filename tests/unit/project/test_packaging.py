@@ -75,7 +75,7 @@ def test_every_template_is_installed() -> None:
 def test_units_are_fixed_text_with_a_manual(unit: Path) -> None:
     text = unit.read_text()
     assert not re.search(r"[{}]|@(?!system-service)|%[a-zA-Z]", text)
-    assert "Documentation=man:dora-systemd(7)" in text
+    assert re.search(r"^Documentation=man:dora-systemd(-security)?\(7\)$", text, re.M)
 
 
 def test_names_of_slice_and_user() -> None:

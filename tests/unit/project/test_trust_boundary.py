@@ -2,8 +2,8 @@
 
 A module that reaches the outside world is in TABLE, with the reason why nobody but root (or the
 account itself) can have put there what it finds. Whatever may be somebody else's goes through
-`trust`. A new line in the table is a decision about trust: read "Who trusts whom" in
-dora-systemd(7) first.
+`trust`. A new line in the table is a decision about trust: read "WHO TRUSTS WHOM"
+in dora-systemd-security(7) first.
 """
 
 import ast

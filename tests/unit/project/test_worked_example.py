@@ -1,4 +1,4 @@
-"""The example of dora-systemd(7), Needs, is what a system test types and sees."""
+"""The example of dora-systemd-nodes(7), NEEDS, is what a system test types and sees."""
 
 from tests.unit.checkout import CHECKOUT
 from tests.unit.project.test_examples import plain
@@ -10,5 +10,5 @@ TASK = CHECKOUT / "tests/system/transcripts/unplugged.txt"
 
 def test_the_camera_robot_of_the_manual() -> None:
     typed = [one for one in TASK.read_text().splitlines() if not one.startswith(("% ", "# "))]
-    blocks = map(plain, literal_blocks(sections("dora-systemd.7")["Needs"]))
+    blocks = map(plain, literal_blocks(sections("dora-systemd-nodes.7")["NEEDS"]))
     assert "\n".join([*typed, ""]) in blocks
