@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.bus.manager import Beside, Property
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.colors import wants_colors
 from dora_systemd.cli.parameters import print_warnings
-from dora_systemd.cli.stageline import StageLine
+from dora_systemd.cli.terminal import StageLine, wants_colors
 from dora_systemd.decisions.logs.filter import LogFilter
 from dora_systemd.decisions.logs.records import DoraLines, Record
 from dora_systemd.decisions.logs.terminal import TerminalLines

@@ -222,7 +222,7 @@ def _wants_colors() -> bool:
     # Imported late: most lists that are not for a terminal do without it.
     if not sys.stdout.isatty() and "SYSTEMD_COLORS" not in os.environ:
         return False
-    from dora_systemd.cli.colors import wants_colors
+    from dora_systemd.cli.terminal import wants_colors
 
     return wants_colors(sys.stdout)
 

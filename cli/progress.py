@@ -13,10 +13,9 @@ from typing import TextIO
 
 import click
 
-from dora_systemd.cli.colors import is_dumb
 from dora_systemd.cli.edge import print_object
 from dora_systemd.cli.parameters import print_warnings, wants_json
-from dora_systemd.cli.stageline import StageLine
+from dora_systemd.cli.terminal import StageLine, is_dumb
 from dora_systemd.decisions.releases.progress import Pace, Step
 from dora_systemd.decisions.views.releases import step_object
 from dora_systemd.terminal_text import one_line

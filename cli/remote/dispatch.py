@@ -10,8 +10,7 @@ import click
 
 from dora_systemd.cli.group import VerbGroup, doractl, run_verb
 from dora_systemd.cli.remote.plan import ROLLOUTS, Plan, check_hosts, plan_of, valued_flags
-from dora_systemd.cli.remote.several import run_on_all
-from dora_systemd.cli.remote.single import is_terminal, pass_through, run_there
+from dora_systemd.cli.remote.run import is_terminal, pass_through, run_on_all, run_there
 from dora_systemd.decisions.remote.hosts import ALL, Host, given_words
 from dora_systemd.decisions.remote.words import part_hosts
 from dora_systemd.errors import ExitCode

@@ -9,8 +9,7 @@ from click.core import ParameterSource
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import print_warnings
 from dora_systemd.cli.remote.plan import Plan
-from dora_systemd.cli.remote.several import run_on_all
-from dora_systemd.cli.remote.single import pass_through
+from dora_systemd.cli.remote.run import pass_through, run_on_all
 from dora_systemd.decisions.cell.machines import HEAD, Placed, machine_of
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -1,18 +1,28 @@
-"""Prints what several hosts say, each line or object with its host."""
+"""Prints what several hosts say, each line, object, row or record with its host."""
 
+import json
+import shutil
 import sys
-from collections.abc import Sequence
-from typing import Protocol
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Generic, Protocol, TypeVar
 
 import click
 
-from dora_systemd.cli.edge import print_error
+from dora_systemd.cli.edge import print_error, write_own
+from dora_systemd.cli.remote.plan import Plan
+from dora_systemd.cli.terminal import wants_colors
+from dora_systemd.decisions.logs.query import journal_timestamp
+from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.decisions.remote.failures import invalid, too_much
 from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.merge import Merge
+from dora_systemd.decisions.remote.records import TIME, Records, time_of
 from dora_systemd.decisions.remote.stream import Lines, objects_of, read_object, with_host
+from dora_systemd.decisions.remote.words import with_output
 from dora_systemd.decisions.views.objects import error_object, format_json
-from dora_systemd.errors import DoraSystemdError
-from dora_systemd.terminal_text import one_line
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import one_line, shown_log
 
 MOST_BYTES = 64 << 20
 """Of the answer of one host that is printed as a whole."""
@@ -171,3 +181,139 @@ class Complaints:
 
     def _print_object(self, host: Host, value: dict[str, object]) -> None:
         print(format_json(with_host(value, host.text)), file=sys.stderr)
+
+
+Row = TypeVar("Row")
+Shown = Callable[[Mapping[str, list[Row] | None], int | None, bool], str]
+"""The table of the rows by host, None for a dead one; for a terminal of that width, in colours."""
+
+
+class TablePrinter(Whole, Generic[Row]):
+    """One table with a column HOST. nothing: printed instead of an empty one.
+
+    parse: the row of an object, None for what is none.
+    """
+
+    def __init__(
+        self,
+        hosts: Sequence[Host],
+        parse: Callable[[Mapping[str, Any]], Row | None],
+        shown: Shown[Row],
+        nothing: str,
+    ) -> None:
+        super().__init__()
+        self._found: dict[str, list[Row] | None] = {one.text: None for one in hosts}
+        self._parse, self._shown = parse, shown
+        self._nothing = nothing
+
+    def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
+        """Read its rows."""
+        text = self.take(host).strip()
+        if error:
+            return None
+        if not text:  # its doractl has said why on standard error
+            self._found[host.text] = []
+            return None
+        found = objects_of(text, host.text)
+        known = [row for row in map(self._parse, found or ()) if row is not None]
+        if found is None or len(known) < len(found):
+            return invalid(host)
+        self._found[host.text] = known
+        return None
+
+    def finish(self) -> None:
+        """Print the table."""
+        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+        text = self._shown(self._found, width, wants_colors(sys.stdout))
+        if text:
+            write_own(sys.stdout, f"{text}\n")
+        else:
+            click.echo(self._nothing)
+
+
+FORMS = {"short": "export", "cat": "export", "json": "json"}
+"""By the output that was asked for, the output that the hosts are asked for."""
+
+
+def words_of_logs(plan: Plan) -> list[str]:
+    """What each host is asked for. Raises DoraSystemdError (USAGE)."""
+    form = str(plan.options["output"])
+    if form not in FORMS:
+        hint = f"-o {' or -o '.join(FORMS)}"
+        raise DoraSystemdError(f"cannot merge -o {form} of several hosts", hint, ExitCode.USAGE)
+    return with_output([*plan.words], FORMS[form])
+
+
+class LogPrinter:
+    """Merges the records. is_complete of Talks decides when the first ones may be printed.
+
+    key: what JSON objects call the host.
+    """
+
+    def __init__(
+        self, hosts: Sequence[Host], options: Mapping[str, Any], key: str = "host"
+    ) -> None:
+        self._key = key
+        self._form = str(options["output"])
+        is_follow = bool(options["is_follow"] or options["until_end"])
+        names = [one.text for one in hosts]
+        self.merge = Merge(names, is_follow, bool(options["is_reverse"]))
+        self._records = {one: Records() for one in hosts}
+        self._width = max(map(len, names))
+        is_one = len(options["selectors"]) == 1
+        has_colors = wants_colors(sys.stdout)
+        self._terminal = TerminalLines(want_dataflow=not is_one, want_colors=has_colors)
+        self._is_complete = False
+        self._last = dict.fromkeys(hosts, 0)
+
+    def said(self, host: Host, data: bytes) -> DoraSystemdError | None:
+        """Take records."""
+        records, now = self._records[host], time.monotonic()
+        if self._form == "json":
+            for value in records.objects(data):
+                line = json.dumps(with_host(value, host.text, self._key)).encode() + b"\n"
+                self._add(host, time_of(value.get(TIME)), line, now)
+            return None
+        for record in records.exported(data):
+            self._add(host, int(record[TIME]), self._line(host, record), now)
+        return too_much(host) if records.is_too_much else None
+
+    def _add(self, host: Host, at_us: int, line: bytes, now: float) -> None:
+        self._last[host] = max(self._last[host], at_us)
+        self.merge.add(host.text, at_us, line, now)
+
+    def again(self, host: Host, words: Sequence[str]) -> list[str]:
+        """What a host is asked for when it is back: the lines after the last one."""
+        self._records[host] = Records()
+        self.merge.begin(host.text)
+        since = self._last[host] + 1
+        # Not only the last ones; without a line yet, as at first.
+        return (
+            [*words, f"--since={journal_timestamp(since)}", "-n", "all"] if since > 1 else [*words]
+        )
+
+    def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
+        """No more of this host."""
+        del error
+        self.merge.end(host.text)
+        return None
+
+    def look(self, is_complete: bool) -> None:
+        """Print what is due. is_complete: every host was reached or given up."""
+        self._is_complete |= is_complete
+        if self.merge.is_empty:
+            return
+        held = self.merge.take(time.monotonic(), self._is_complete)
+        if text := b"".join(one.data for one in held):
+            write_own(sys.stdout, text.decode("utf-8", "backslashreplace"))
+            sys.stdout.flush()
+
+    def finish(self) -> None:
+        """Print the rest."""
+        self.look(is_complete=True)
+
+    def _line(self, host: Host, record: Mapping[str, bytes]) -> bytes:
+        cat = shown_log(record.get("MESSAGE", b"")) + b"\n"
+        text = cat if self._form == "cat" else self._terminal.record(record)
+        start = f"{host.text:<{self._width}} ".encode()
+        return b"".join(start + line + b"\n" for line in text[:-1].split(b"\n"))

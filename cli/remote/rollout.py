@@ -10,9 +10,8 @@ import click
 from dora_systemd.cli.edge import print_warning
 from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.remote.printers import Complaints
-from dora_systemd.cli.remote.several import run_on_all
-from dora_systemd.cli.remote.single import Interrupts
-from dora_systemd.cli.stageline import StageLine
+from dora_systemd.cli.remote.run import Interrupts, run_on_all
+from dora_systemd.cli.terminal import StageLine
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.parcel import format_parcel, parse_wants, total
 from dora_systemd.decisions.remote.command import Way

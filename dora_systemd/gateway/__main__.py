@@ -19,7 +19,7 @@ from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.host.files import read_text, write_atomic
 from dora_systemd.decisions.gateway.place import is_directory_of_user, token_path
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.gateway.live.acting import ACTIONS
+from dora_systemd.gateway.live.actions import ACTIONS
 from dora_systemd.gateway.server import Gateway
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND, parse_duration

@@ -28,7 +28,7 @@ from dora_systemd.decisions.gateway.access import (
 from dora_systemd.decisions.gateway.request import Answer, Request, text_answer
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.connection import Gone, ServerSocket
-from dora_systemd.gateway.live.acting import ACTIONS
+from dora_systemd.gateway.live.actions import ACTIONS
 from dora_systemd.gateway.routes import GET, OPEN_TO_ALL, SOCKETS
 from dora_systemd.scope import Scope
 from dora_systemd.trust.socket_table import peer_uid

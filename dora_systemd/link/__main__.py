@@ -1,29 +1,97 @@
-"""The main process of a link: it takes the words of the head's runner to a member, and back.
+"""The main process of a link: it carries the lines of the runner of the head to a member, and back.
 
 It ends with its ssh(1), and systemd starts it again: each connection begins with the ports and the
 part that the runner gives then. A machine that is away is no failure of the link.
 """
 
+import json
 import os
+import socket
 import sys
 import time
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.decisions.machines.link_command import (
     LinkOptions,
     parse_link_argv,
     ssh_link_arguments,
 )
-from dora_systemd.decisions.machines.wire import Refused
+from dora_systemd.decisions.machines.wire import MAX_LINE, Forwards, Refused, expect, parse_message
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.link.greeting import Greeted, greeted
-from dora_systemd.link.program import Program
-from dora_systemd.link.talk import Talk, tell
-from dora_systemd.link.watchdog import Watchdog
+from dora_systemd.link.talk import Program, Talk, tell
 from dora_systemd.trust.paths import exists
+from dora_systemd.trust.sockets import connect_unix
 
+_ANSWER_SECONDS = 10.0
+"""For each answer: the runner knows its ports soon."""
+_CHUNK = 1 << 16
+_PAUSE_SECONDS = 1.0
 _FIRST_SECONDS, _LATER_SECONDS = 0.01, 0.25
 _QUICK_TRIES = 500
+
+
+class Greeted(NamedTuple):
+    """A session with a runner."""
+
+    runner: socket.socket
+    forwards: Forwards
+    rest: bytes  # what the runner has sent after its ports
+
+
+def greeted(path: Path, machine: str) -> Greeted | None:
+    """A session for the link to `machine`; None if no runner is at `path` that has one now.
+
+    Raises DoraSystemdError (NO_PERMISSION) if the socket is another user's.
+    """
+    with ExitStack() as undo:
+        try:
+            runner = undo.enter_context(connect_unix(path, _ANSWER_SECONDS))
+            runner.sendall(json.dumps({"verb": "link", "machine": machine}).encode() + b"\n")
+            line, rest = _first_line(runner)
+            forwards = expect(parse_message(line), Forwards)
+        except OSError:
+            return None
+        except DoraSystemdError as error:
+            if error.code is ExitCode.NO_PERMISSION:
+                raise
+            return None
+        runner.settimeout(None)
+        undo.pop_all()
+        return Greeted(runner, forwards, rest)
+
+
+def _first_line(runner: socket.socket) -> tuple[bytes, bytes]:
+    data = b""
+    while b"\n" not in data and len(data) < MAX_LINE:
+        more = runner.recv(_CHUNK)
+        if not more:
+            raise ConnectionError
+        data += more
+    line, _, rest = data.partition(b"\n")
+    return line, rest
+
+
+class Watchdog:
+    """Sends WATCHDOG=1 at most once a second; does nothing without NOTIFY_SOCKET.
+
+    A link that hangs looks to the head like a machine that is away, and nobody else would end it.
+    """
+
+    def __init__(self) -> None:
+        path = os.environ.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + path[1:] if path.startswith("@") else path
+        self._last = float("-inf")
+
+    def feed(self) -> None:
+        """Send the message, if one is due."""
+        now = time.monotonic()
+        if self._address and now - self._last >= _PAUSE_SECONDS:
+            self._last = now
+            kind = socket.SOCK_DGRAM | socket.SOCK_NONBLOCK
+            with suppress(OSError), socket.socket(socket.AF_UNIX, kind) as one:
+                one.sendto(b"WATCHDOG=1", self._address)
 
 
 def main() -> int:

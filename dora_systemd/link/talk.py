@@ -5,6 +5,7 @@ To the head a member is hostile: what comes from it is passed on in whole lines 
 
 import os
 import select
+import signal
 import socket
 import time
 from collections.abc import Callable
@@ -20,12 +21,71 @@ from dora_systemd.decisions.machines.wire import (
     format_message,
 )
 from dora_systemd.decisions.remote.stream import AfterMark
-from dora_systemd.link.program import Program, read_now
 
 ANSWER_SECONDS = 30.0
 """For the first line of the member: a login, and doractl there, on a machine that is busy."""
 _CHUNK = 1 << 16
 _COMPLAINT = 4096
+_END_SECONDS = 2.0
+"""For a program to end, before it is killed."""
+
+
+class Program:
+    """A running program with pipes, looked up in PATH. Leaving its block ends it.
+
+    input, output, errors: our ends of its pipes. Raises OSError if it cannot be executed. Not
+    subprocess: that takes a megabyte of each link for good.
+    """
+
+    def __init__(self, name: str, arguments: list[str]) -> None:
+        theirs_in, self.input = os.pipe()
+        self.output, theirs_out = os.pipe()
+        self.errors, theirs_err = os.pipe()
+        theirs = (theirs_in, theirs_out, theirs_err)
+        try:
+            actions = [(os.POSIX_SPAWN_DUP2, fd, number) for number, fd in enumerate(theirs)]
+            self._pid = os.posix_spawnp(
+                name,
+                [name, *arguments],
+                os.environ,
+                file_actions=actions,
+                setsigdef=[signal.SIGPIPE],
+            )
+        finally:
+            for fd in theirs:
+                os.close(fd)
+        self.ended = os.pidfd_open(self._pid)
+        self._status: int | None = None
+
+    def __enter__(self) -> "Program":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+        for fd in (self.input, self.output, self.errors, self.ended):
+            os.close(fd)
+
+    def end(self) -> int:
+        """End it, if it has not ended; its exit status, negative for a signal."""
+        if self._status is None:
+            if not _waits(self.ended, 0):
+                signal.pidfd_send_signal(self.ended, signal.SIGTERM)
+            if not _waits(self.ended, _END_SECONDS):
+                signal.pidfd_send_signal(self.ended, signal.SIGKILL)
+            self._status = os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
+        return self._status
+
+
+def read_now(fd: int, size: int = 1 << 16) -> bytes:
+    """What can be read without waiting; b"" if there is nothing, or will be nothing more."""
+    os.set_blocking(fd, False)
+    with suppress(BlockingIOError):
+        return os.read(fd, size)
+    return b""
+
+
+def _waits(fd: int, seconds: float) -> bool:
+    return bool(select.select([fd], [], [], seconds)[0])
 
 
 class Talk:
@@ -163,7 +223,7 @@ class Talk:
 
     def _last_word(self, host: str, status: int) -> FromLink:
         # Imported late: most of the time nothing is lost.
-        from dora_systemd.link.parting import last_word
+        from dora_systemd.link.end_reason import last_word
 
         if self._excuse:
             return Lost(self._excuse)

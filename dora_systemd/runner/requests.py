@@ -232,9 +232,11 @@ def _not_running(why: str) -> DoraSystemdError:
 
 
 class Recheck:
-    """Answers {"verb": "check"}; `answer` answers all other requests.
+    """Answers {"verb": "check"}: whether the dataflow could start again.
 
-    environment: of the nodes.
+    `doractl restart` asks before it stops anything. The files are checked as the nodes' user, in
+    their sandbox and with their environment, and the errors are those of a start. `answer` answers
+    all other requests. environment: of the nodes.
     """
 
     def __init__(self, role: Alone, environment: Mapping[str, str], answer: Answer) -> None:

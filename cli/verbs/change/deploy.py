@@ -23,7 +23,7 @@ from dora_systemd.cli.parameters import (
     wants_json,
 )
 from dora_systemd.cli.progress import open_progress, quiet_option
-from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
+from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.releases.deploy import (

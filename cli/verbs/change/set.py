@@ -12,7 +12,7 @@ from dora_systemd.cli.parameters import (
     print_outcomes,
     print_warnings,
 )
-from dora_systemd.cli.settingoptions import live_options
+from dora_systemd.cli.setting_options import live_options
 from dora_systemd.decisions.settings.resolve import is_given
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.scope import Scope

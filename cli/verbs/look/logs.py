@@ -12,8 +12,8 @@ from typing import Any
 import click
 
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
-from dora_systemd.cli.colors import is_dumb, wants_colors
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.cli.terminal import is_dumb, wants_colors
 from dora_systemd.decisions.logs.filter import parse_filter
 from dora_systemd.decisions.logs.query import (
     ALL_LINES,

@@ -6,9 +6,9 @@ import time
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.colors import is_dumb
-from dora_systemd.cli.live import FIRST_SECONDS, show_live
 from dora_systemd.cli.parameters import current_scope, output_option, scope_options
+from dora_systemd.cli.screen import FIRST_SECONDS, show_live
+from dora_systemd.cli.terminal import is_dumb
 from dora_systemd.decisions.views.objects import format_json
 from dora_systemd.decisions.views.top import SORTS, format_top, look_values
 from dora_systemd.errors import ExitCode

@@ -10,7 +10,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
+from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.machines.address import parse_address
 from dora_systemd.decisions.machines.key import ORIGINAL, forced_words

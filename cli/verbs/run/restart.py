@@ -10,7 +10,7 @@ from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
-from dora_systemd.cli.stageline import StageLine
+from dora_systemd.cli.terminal import StageLine
 from dora_systemd.verbs.facts.cells import refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.needs.dependents import find_dependents, format_dependents

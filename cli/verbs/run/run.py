@@ -15,7 +15,7 @@ from dora_systemd.cli.parameters import (
     print_warnings,
     scope_options,
 )
-from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
+from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.decisions.logs.filter import RAW, LogFilter, parse_filter
 from dora_systemd.decisions.logs.records import DORA_LEVELS
 from dora_systemd.names import unit_name

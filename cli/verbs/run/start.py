@@ -19,8 +19,8 @@ from dora_systemd.cli.parameters import (
     print_warnings,
     wants_json,
 )
-from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
-from dora_systemd.cli.stageline import StageLine
+from dora_systemd.cli.setting_options import SettingsCommand, setting_options
+from dora_systemd.cli.terminal import StageLine
 from dora_systemd.decisions.settings.resolve import is_given
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode

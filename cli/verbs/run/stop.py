@@ -16,7 +16,7 @@ from dora_systemd.cli.parameters import (
     require_names_or_all,
     tell,
 )
-from dora_systemd.cli.stageline import StageLine
+from dora_systemd.cli.terminal import StageLine
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -17,8 +17,8 @@ from dora_systemd.decisions.dora.protocol import Params, Reply
 from dora_systemd.decisions.gateway.answers import restored_descriptor
 from dora_systemd.decisions.gateway.frames import Request, renamed
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.session import Result, Talk, find_by_uuid
 from dora_systemd.gateway.control.state import ended_descriptor
-from dora_systemd.gateway.control.talk import Result, Talk, find_by_uuid
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.nodes import written_dataflow

@@ -19,8 +19,8 @@ from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import end_matches, journal_timestamp, scope_matches
 from dora_systemd.decisions.logs.records import LOG_FIELDS, Record, log_payload, record_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.session import Place, Result, Talk, find_if_loaded
 from dora_systemd.gateway.control.state import find_name
-from dora_systemd.gateway.control.talk import Place, Result, Talk, find_if_loaded
 from dora_systemd.names import did_you_mean
 from dora_systemd.scope import Scope
 from dora_systemd.values import quoted

@@ -25,7 +25,7 @@ from dora_systemd.gateway.control import forward as cell
 from dora_systemd.gateway.control import logs, state
 from dora_systemd.gateway.control import start as starting
 from dora_systemd.gateway.control import stop as stopping
-from dora_systemd.gateway.control.talk import Result, Talk
+from dora_systemd.gateway.control.session import Result, Talk
 
 log = logging.getLogger(__name__)
 

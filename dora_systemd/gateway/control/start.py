@@ -22,8 +22,8 @@ from dora_systemd.decisions.descriptor.build_session import session_path
 from dora_systemd.decisions.gateway.flags import sent_flags
 from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.session import Result, Talk
 from dora_systemd.gateway.control.state import spawned
-from dora_systemd.gateway.control.talk import Result, Talk
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import list_directory

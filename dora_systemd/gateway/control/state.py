@@ -19,7 +19,7 @@ from dora_systemd.decisions.views.dataflows import FAILED, FINISHED
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Report
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.gateway.control.talk import find_by_uuid, find_if_loaded
+from dora_systemd.gateway.control.session import find_by_uuid, find_if_loaded
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_rows

@@ -12,8 +12,8 @@ from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.session import Talk, find_by_uuid
 from dora_systemd.gateway.control.state import ended_result
-from dora_systemd.gateway.control.talk import Talk, find_by_uuid
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts

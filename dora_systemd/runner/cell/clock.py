@@ -86,9 +86,12 @@ PATIENCE_SECONDS = 120.0
 
 
 class Keepalive:
-    """Tells systemd that the runner is alive.
+    """Sends WATCHDOG=1 from its own thread, because anything in the event loop may be held up.
 
-    seconds: between two messages. patience: seconds that the loop may stand still.
+    A machine without time to spare, a disk or a kernel that keeps a call waiting: none of these is
+    a reason to end healthy nodes. A runner that is stopped sends nothing, and so does one whose
+    loop has stood still for PATIENCE_SECONDS: both hang. seconds: between two messages. patience:
+    seconds that the loop may stand still.
     """
 
     def __init__(

@@ -202,7 +202,10 @@ _LOOK_SECONDS = 0.05
 
 
 async def end_nodes(nodes: Nodes, own: Iterable[str], seconds: float) -> None:
-    """SIGTERM for every process of the nodes `own`; SIGKILL for what is left after `seconds`."""
+    """End the nodes `own` without dora, which would wait for a machine that is gone.
+
+    Every process gets SIGTERM, and SIGKILL if it is left after `seconds`.
+    """
     unit, _ = nodes.places
     own = list(own)
     nodes.let_go()

@@ -65,7 +65,11 @@ def _load(path: Path, key: str, samples: tuple[CpuSample, ...], now: CpuSample) 
 
 
 class Hold:
-    """Freezes the cgroup of one node while too many bytes of its output are unread."""
+    """Freezes the cgroup of one node while too many bytes of its output are unread.
+
+    Only nodes whose output dora's daemon reads: one with pipes blocks in write(2) instead. The
+    kernel freezes a group by cgroup.freeze, see cgroups(7).
+    """
 
     def __init__(self, group: Path, marks: Marks) -> None:
         self._group = group

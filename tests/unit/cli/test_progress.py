@@ -8,7 +8,7 @@ import pytest
 
 from dora_systemd.cli.progress import Progress
 from dora_systemd.decisions.releases.progress import Step, checking, copied, copying, judged
-from tests.unit.cli.test_stageline import Terminal
+from tests.unit.cli.test_terminal import Terminal
 
 STEPS = (copying(1, 3), copying(2, 3), copied(1, 3, 0), checking(), checking(), judged("X", ""))
 

@@ -40,8 +40,8 @@ from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.serve import HANDLERS, REFUSED, serve_control
+from dora_systemd.gateway.control.session import Talk
 from dora_systemd.gateway.control.start import find_file
-from dora_systemd.gateway.control.talk import Talk
 from dora_systemd.scope import Scope
 from tests.unit.fakes.ends import FakeWriter
 from tests.unit.fakes.socket import FakeSocket

@@ -13,7 +13,7 @@ from dora_systemd.decisions.gateway.page_messages import PageMessage
 from dora_systemd.decisions.gateway.request import Request
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.live.lines import MAX_LINES
-from dora_systemd.gateway.live.talk import MAX_TASKS, Means, Page, pause_after, talk
+from dora_systemd.gateway.live.page import MAX_TASKS, Means, Page, pause_after, talk
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import FakeSystemd, fake_systemd
 from tests.unit.fakes.loop import within

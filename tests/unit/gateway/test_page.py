@@ -11,7 +11,7 @@ from dora_systemd.decisions.views.dataflows import UP_WORDS
 from dora_systemd.decisions.views.facts import NODE_FACTS, USAGE, NodeRow
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.rows import DataflowRow
-from dora_systemd.gateway.page import DIRECTORY, HEADERS, PREFIX, TYPES, page_routes
+from dora_systemd.gateway.routes import DIRECTORY, HEADERS, PREFIX, TYPES, page_routes
 from dora_systemd.scope import Scope
 
 FILES = sorted(DIRECTORY.iterdir())

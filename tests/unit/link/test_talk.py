@@ -18,8 +18,7 @@ from dora_systemd.decisions.machines.wire import (
     format_message,
     parse_message,
 )
-from dora_systemd.link.program import Program
-from dora_systemd.link.talk import Talk
+from dora_systemd.link.talk import Program, Talk
 
 READY = b'{"type": "ready", "work": "/run/x"}\n'
 

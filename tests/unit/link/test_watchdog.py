@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.link.program import Program
-from dora_systemd.link.talk import Talk
-from dora_systemd.link.watchdog import Watchdog
+from dora_systemd.link.__main__ import Watchdog
+from dora_systemd.link.talk import Program, Talk
 
 
 def test_each_turn_feeds_it_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

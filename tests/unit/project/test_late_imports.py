@@ -13,7 +13,7 @@ LATE = {
     },
     "the gateway does without it until somebody looks at releases, or rolls back": {
         "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
-        "gateway.live.act": {"verbs.releases.on_trial", "verbs.releases.rollback"},
+        "gateway.live.actions": {"verbs.releases.on_trial", "verbs.releases.rollback"},
     },
     "only some verbs wrap, and only on a terminal": {
         "terminal_text": {"textwrap"},
@@ -22,14 +22,14 @@ LATE = {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended", "verbs.facts.list"),
             *("decisions.views.details", "decisions.views.objects"),
-            *("decisions.views.selection", "cli.colors", "verbs.facts.selector"),
+            *("decisions.views.selection", "cli.terminal", "verbs.facts.selector"),
             *("adapters.cgroup.groups", "decisions.gateway.place"),
         },
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
     },
     "shutil imports every compressor: only a terminal has a width; a pipe hears of machines": {
-        "cli.stageline": {"shutil", "decisions.machines.awaited"},
+        "cli.terminal": {"shutil", "decisions.machines.awaited"},
     },
     "a start that succeeds has no last words, most follow no log and copy no files": {
         "cli.verbs.run.start": {
@@ -111,7 +111,7 @@ LATE = {
         "verbs.start.unit": {"decisions.machines.link_unit"},
         "verbs.start.claim": {"decisions.machines.link_unit"},
         "verbs.start.enable": {"decisions.machines.link_unit"},
-        "link.talk": {"link.parting"},
+        "link.talk": {"link.end_reason"},
         "link.relay": {"signal"},
     },
     "in the child that reads a project, whose interpreter does not look for it": {

@@ -261,7 +261,7 @@ STARTS_PROGRAMS = {
     "adapters.dora.engine": "dora's, in a cell",
     "adapters.journal.journalctl": "journalctl",
     "adapters.ssh": "ssh, as the caller",
-    "link.program": "ssh, as the caller of doractl start",
+    "link.talk": "ssh, as the caller of doractl start",
     "verbs.machines.member": "itself, as a smaller program",
     "adapters.host.guard": "itself, without another program",
     "verbs.node": "dora, as the caller",

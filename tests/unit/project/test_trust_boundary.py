@@ -71,7 +71,7 @@ _TABLE = {
         verbs.logs verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """
-        cli.group gateway.page
+        cli.group gateway.routes
     """,
     CELL: """
         adapters.dora.check adapters.dora.engine adapters.dora.websocket adapters.host.fd_store

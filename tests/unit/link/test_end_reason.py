@@ -3,7 +3,7 @@
 import pytest
 
 from dora_systemd.decisions.machines.wire import Lost, Unreached
-from dora_systemd.link.parting import last_word
+from dora_systemd.link.end_reason import last_word
 
 OF_DORACTL = "doractl: it has no address 10.99.0.2\nhint: see machines in dora-systemd.yml(5)\n"
 

@@ -4,7 +4,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
+from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 
 
 @click.command(cls=SettingsCommand)

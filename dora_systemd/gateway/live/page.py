@@ -22,7 +22,7 @@ from dora_systemd.decisions.gateway.request import Request, Socket
 from dora_systemd.decisions.views.snapshot import observed_values
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.live.about import read_about, read_ended, read_own_releases
-from dora_systemd.gateway.live.act import act, read_graph
+from dora_systemd.gateway.live.actions import act, read_graph
 from dora_systemd.gateway.live.lines import (
     MAX_FOUND,
     MAX_LINES,
