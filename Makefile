@@ -1,6 +1,6 @@
 # Everything runs from a bare Debian 12 or 13 as root; what is missing is installed, and said, first.
 #   LAB=container  system tests in a systemd-nspawn container (default)
-#   LAB=vm         system tests in a virtual machine
+#   LAB=vm         system tests in a machine with a kernel of its own
 #   LAB=host       system tests right here, on a machine booted with systemd
 
 LAB ?= container
@@ -35,6 +35,10 @@ quick:  ## the heart of the system tests, in less than two minutes
 vm:  ## system tests that need a kernel of their own
 	@$(PREPARE) container vm
 	@$(CHECK) vm
+
+emulator:  ## system tests that need Debian's kernel and two processors
+	@$(PREPARE) container vm
+	@$(CHECK) emulator
 
 faults:  ## every fault of tests/system/faults, ROUNDS=n times
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
@@ -116,4 +120,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm faults history power fuzz mutants browser machines bench bench-quick bookworm lint demo clean deb wheels autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm emulator faults history power fuzz mutants browser machines bench bench-quick bookworm lint demo clean deb wheels autopkgtest

@@ -9,7 +9,7 @@ from dora_systemd.scope import scope_of
 from tests.boot.flows import AFTER, ALICE, NOTES, ROOT, check_typed, doractl, listed
 from tests.system.cells import run, wait_for
 
-# Asked often, and much faster than doractl in an emulated machine.
+# Asked often, and much faster than doractl in a machine of the lab.
 HERS = ("--user", "--machine=alice@")
 
 

@@ -15,7 +15,7 @@ for event in Node():
     pass
 """
 NEVER_READY = "nodes: [{id: only, path: sleep, args: '100000'}]\n"
-# Seldom: four of these share one emulated processor.
+# Seldom: four of these share one slow processor.
 FLOW = "nodes: [{id: only, path: node.py, inputs: {tick: dora/timer/secs/5}}]\n"
 BROKEN = """nodes: [{id: only, path: sh, args: "-c 'echo no camera there; exit 3'"}]\n"""
 

@@ -36,6 +36,9 @@ OLD_PACKAGES = [
     "python3-yaml",
 ]  # fmt: skip
 
+# The next one, which is not released yet.
+NEW_SUITE = "forky"
+
 KERNEL = "linux-image-cloud-amd64"
 
 # What `pip install --editable` reads of the checkout, apart from the code it points at.

@@ -57,12 +57,14 @@ def debian_command(
     path: Path, variant: str, packages: list[str], suite: str = definition.SUITE
 ) -> list[str]:
     mirror = os.environ.get("LAB_MIRROR")
+    # A mirror that is not updated any more has it expire, in a suite that is not released.
+    expired = ["--aptopt=Acquire::Check-Valid-Until false"] if suite == definition.NEW_SUITE else []
     return [
         "mmdebstrap", f"--variant={variant}", "--mode=root", "--format=directory",
         f"--include={','.join(packages)}",
         "--dpkgopt=path-exclude=/usr/share/doc/*",
         "--dpkgopt=path-exclude=/usr/share/locale/*",
-        suite, str(path), *([mirror] if mirror else []),
+        *expired, suite, str(path), *([mirror] if mirror else []),
     ]  # fmt: skip
 
 

@@ -11,12 +11,14 @@ from lab.cache import find_cache, remove_layer
 from lab.container import run_in_container
 from lab.errors import LabError
 from lab.image import ensure_tree
-from lab.machine import ensure_machine, run_in_machine
+from lab.machine import run_in_emulator, run_in_vm
 from lab.machines import run_in_machines
 from lab.options import Options, parse_options
 from lab.process import need_root
 from lab.rivals import ensure_rivals
 from lab.runs import Guard, clean_dead_runs, close_run, open_run, opened_door
+from lab.snapshot import ensure_snapshot
+from lab.user_kernel import ensure_user_kernel
 
 # As in docker and timeout: the lab's own failure is told apart from the command's.
 LAB_FAILED = 125
@@ -78,7 +80,8 @@ def clean(options: Options) -> int:
 
 ENSURE = {
     "container": ensure_tree,
-    "vm": ensure_machine,
+    "vm": ensure_user_kernel,
+    "emulator": ensure_snapshot,
     "bookworm": ensure_bookworm,
     "rivals": ensure_rivals,
     "browser": ensure_browser,
@@ -86,7 +89,8 @@ ENSURE = {
 }
 RUN = {
     "container": run_in_container,
-    "vm": run_in_machine,
+    "vm": run_in_vm,
+    "emulator": run_in_emulator,
     "bookworm": run_in_container,
     "rivals": run_in_container,
     "browser": run_in_container,

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from lab.errors import LabError
 
-FORMS = ("container", "vm", "bookworm", "rivals", "browser", "machines")
+FORMS = ("container", "vm", "emulator", "bookworm", "rivals", "browser", "machines")
+
+MACHINES = ("vm", "emulator")
 
 REBOOT = "--reboot--"
 
@@ -16,7 +18,8 @@ EPILOG = """\
 environment:
   LAB=container     a systemd-nspawn container (default): starts in half a second;
                     systemd accepts limits there but cannot enforce them
-  LAB=vm            a virtual machine with its own kernel and cgroup v2 controllers
+  LAB=vm            a machine with a kernel of its own, as a process, and cgroup v2 controllers
+  LAB=emulator      an emulated machine with Debian's kernel: PSI, cpusets, two processors
   LAB=bookworm      a container with Debian 12: systemd 252, Python 3.11, the checkout
                     not installed, but all that pip needs to do so
   LAB=rivals        the container with supervisord, circus and pm2, for benchmarks
@@ -30,7 +33,7 @@ environment:
 The command runs as root in a private copy of the checkout, /src; what it writes
 there is gone afterwards. Inside, LAB names the form. The exit status is the
 command's, 128+N if signal N killed it, 125 if the lab itself failed.
-With LAB=vm, CMD1 --reboot-- CMD2 restarts the machine in between, if CMD1 succeeds.
+With LAB=vm or emulator, CMD1 --reboot-- CMD2 restarts the machine in between, if CMD1 succeeds.
 """
 
 
@@ -49,7 +52,7 @@ class Options:
 def parse_options(arguments: Sequence[str], environ: Mapping[str, str] = os.environ) -> Options:
     given = build_parser().parse_args(arguments)
     form = parse_form(environ.get("LAB") or FORMS[0])
-    if getattr(given, "cuts", False) and form != "vm":
+    if getattr(given, "cuts", False) and form not in MACHINES:
         raise LabError("cut the power of a container", "LAB=vm")
     return Options(
         verb=given.verb,

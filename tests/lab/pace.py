@@ -1,8 +1,8 @@
 """How slow this machine is just now: bounds of tests are in seconds of an idle machine.
 
-An emulated processor is ten times slower than the host's, a busy host two to five times slower than
-an idle one. A test says how long a thing may take where nothing is in its way; how much longer that
-is here is measured here, and nowhere else.
+An emulated processor is ten times slower than the host's, a kernel in user mode four times, a busy
+host two to five times slower than an idle one. A test says how long a thing may take where nothing
+is in its way; how much longer that is here is measured here, and nowhere else.
 """
 
 import subprocess

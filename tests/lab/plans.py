@@ -15,6 +15,7 @@ from lab.cache import find_cache
 from lab.changed import changed_rooms
 from lab.definition import CHECKOUT
 from lab.errors import LabError
+from lab.options import MACHINES
 from lab.process import need_root
 from lab.steps import Step, run_steps
 from lab.venv import add_package, ensure_venv, venv_environment, write_package
@@ -24,6 +25,7 @@ MUTMUT = "mutmut==3.8.1"
 # xdist would name its processes with it, and some tests look at their own command line.
 NOT_WITH_MUTMUT = "setproctitle"
 FAULTS = "tests/system/faults"
+NO_KERNEL = "not vm and not emulator"
 # Containers at the same time. Most of the time of a test is waiting, and one more than three makes
 # two cores so busy that the tests wait for each other.
 CONTAINERS = 3
@@ -57,6 +59,7 @@ def plan_test(form: str) -> list[Step]:
     restarted = replace(reboot_step(), after=(build.name, inside.name))
     oldest = plan_bookworm(form)[1:]
     lane = [build, packages_step(), *oldest, *plan_lab(form), *plan_other_python(form)]
+    lane += plan_emulator(form)
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
     return [unit, several, *in_a_row(lane, unit), inside, restarted, *queue]
 
@@ -117,7 +120,13 @@ def plan_vm(_form: str) -> list[Step]:
 
 def limits_step() -> Step:
     arguments = ["tests/system", "-m", "vm"]
-    return lab_step("system tests that need limits, vm", "vm", arguments, minutes=15)
+    return lab_step("system tests that need limits, vm", "vm", arguments, minutes=5)
+
+
+def plan_emulator(_form: str) -> list[Step]:
+    arguments = ["tests/system", "-m", "emulator"]
+    name = "system tests that need Debian's kernel, emulator"
+    return [lab_step(name, "emulator", arguments, minutes=3)]
 
 
 def build_step() -> Step:
@@ -131,7 +140,7 @@ def reboot_step() -> Step:
     for place, stage in enumerate(stages):
         command += ["--reboot--"] if place else []
         command += ["pytest", *(f"tests/boot/test_{name}.py" for name in stage)]
-    return Step("the packages, a reboot and a power cut, vm", command, in_lab("vm"), minutes=8)
+    return Step("the packages, a reboot and a power cut, vm", command, in_lab("vm"), minutes=3)
 
 
 def plan_packages(_form: str) -> list[Step]:
@@ -153,7 +162,7 @@ def plan_bookworm(_form: str) -> list[Step]:
 
 def plan_system(form: str) -> list[Step]:
     here = " and not lab" if form == "host" else ""
-    arguments = ["tests/system", "-m", f"not vm{here}"]
+    arguments = ["tests/system", "-m", f"{NO_KERNEL}{here}"]
     if form == "container":
         return queue_steps("system tests", "browser", arguments, minutes=14)
     if form != "host":
@@ -182,7 +191,7 @@ def machines_step() -> Step:
 def plan_faults(form: str) -> list[Step]:
     """Every fault as often as ROUNDS says; a machine of its own, and nothing beside it."""
     rounds = os.environ.get("ROUNDS") or "1"
-    marks = "vm" if form == "vm" else "not vm"
+    marks = form if form in MACHINES else NO_KERNEL
     command = ["tests/lab/lab", "run", "--env", f"FAULT_ROUNDS={rounds}", "--", "pytest"]
     command += [FAULTS, "-m", marks]
     return [Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))]
@@ -231,7 +240,7 @@ def in_venv_with_mutmut() -> dict[str, str]:
 def plan_quick(_form: str) -> list[Step]:
     """The heart of the system tests."""
     files = [f"tests/system/test_{name}.py" for name in QUICK]
-    return queue_steps("quick system tests", "container", [*files, "-m", "not vm"])
+    return queue_steps("quick system tests", "container", [*files, "-m", NO_KERNEL])
 
 
 def queue_steps(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> list[Step]:
@@ -282,6 +291,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "other-python": plan_other_python,
     "lab": plan_lab,
     "vm": plan_vm,
+    "emulator": plan_emulator,
     "packages": plan_packages,
     "bookworm": plan_bookworm,
     "browser": plan_browser,

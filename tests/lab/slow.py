@@ -1,4 +1,4 @@
-"""How much of the host the emulator gets.
+"""How much of the host a machine gets: an emulator, or a kernel in user mode.
 
 LAB_SPEED=50 gives it half of its time: a slow machine, to try the tests on.
 """
@@ -20,7 +20,7 @@ GROUP_NICE = -3
 
 
 def read_speed(text: str | None) -> int:
-    """Percent of the time that the emulator runs. Raises LabError."""
+    """Percent of the time that the machine runs. Raises LabError."""
     speed = int(text) if text and text.isdecimal() else 0 if text else FULL_SPEED
     if not 1 <= speed <= FULL_SPEED:
         raise LabError(f"use LAB_SPEED={text}", "percent, 1 to 100")

@@ -123,6 +123,18 @@ def test_random_numbers_differ(env: dict[str, str]) -> None:
     assert len({*first, *second}) == 4
 
 
+def test_the_emulator_takes_and_gives(tmp_path: Path) -> None:
+    env = {**os.environ, "LAB": "emulator", "LAB_OUT": str(tmp_path)}
+    script = "ls /src/pyproject.toml; cat; nproc > /out/processors; exit 3"
+    assert lab(env, "run", "--", "sh", "-c", script, given=b"in") == (
+        3,
+        b"/src/pyproject.toml\nin",
+        b"",
+    )
+    assert (tmp_path / "processors").read_text() == "2\n"
+    assert_nothing_left()
+
+
 def test_reboot_between_commands() -> None:
     env = {**os.environ, "LAB": "vm"}
     script = "cat /proc/sys/kernel/random/boot_id; ls /var/tmp/kept; touch /var/tmp/kept"

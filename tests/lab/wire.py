@@ -2,7 +2,8 @@
 
 A frame is a letter, a length, and so many bytes. To the agent: `R` a request (JSON), `I` standard
 input (empty: its end), `W` the terminal's size. From it: `H` it has started, `O` and `E` output,
-`X` the exit status. One command at a time. Also imported by the agent, so: nothing but Python.
+`X` the exit status, and `A` how many bytes it has read (see line.py). One command at a time. Also
+imported by the agent, so: nothing but Python.
 """
 
 import struct

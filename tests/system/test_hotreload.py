@@ -381,7 +381,7 @@ def test_a_settings_file(cell: Cell, project: Project) -> None:
     before = pids(cell)
     limit, run = cell.group / "node-sink/memory.max", cell.status.run
     settings = project.write("dataflow.systemd.yml", "nodes: {sink: {memory_limit: 1G}}")
-    # Files are asked first: reading the journal takes all of an emulated processor.
+    # Files are asked first: reading the journal takes all of a slow processor.
     wait_for("it is limited", lambda: limit.read_text() == f"{1 << 30}\n")
     (record,) = wait_reloads(cell, 1)
     assert record["MESSAGE"] == "Node sink was given new limits: dataflow.systemd.yml"

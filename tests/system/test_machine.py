@@ -13,8 +13,6 @@ from dora_systemd.adapters.cgroup.groups import read_cpu
 from dora_systemd.errors import ExitCode
 from tests.system.cells import TICK, Cell, Project, is_alive, run, wait_for
 
-pytestmark = pytest.mark.vm
-
 LEAK = """
 from dora import Node
 import time
@@ -25,7 +23,7 @@ for event in node:
 """
 
 
-# In an emulated machine three nodes take all the CPU time there is.
+# In a machine of the lab three nodes take all the CPU time there is.
 ALONE = "nodes: [{id: sink, path: sink.py, inputs: {t: dora/timer/millis/100}}]"
 KILLED_FOR_MEMORY = (
     r"the (supervisor process was killed, out of memory|dora \w+ is gone \(out of memory, )"
@@ -37,6 +35,7 @@ subprocess.Popen(["sleep", "1000"])
 """
 
 
+@pytest.mark.vm
 def test_node_groups_have_controllers_and_messages_shared_memory(
     cell: Cell, project: Project
 ) -> None:
@@ -56,6 +55,7 @@ def test_node_groups_have_controllers_and_messages_shared_memory(
 
 @pytest.mark.warns("oom", "OOM", "killed", "crashed", "node exited with error", "failed", "Failed")
 @pytest.mark.warns("has used up its memory limit", "is close to a memory limit")
+@pytest.mark.vm
 def test_a_limit_of_the_unit_kills_the_leaking_node_alone(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     project.write("sink.py", LEAK)
@@ -89,6 +89,7 @@ def test_a_limit_of_the_unit_kills_the_leaking_node_alone(cell: Cell, project: P
 
 @pytest.mark.warns("oom", "OOM", "killed", "node exited with error", "restart", "Failed")
 @pytest.mark.warns("Memory", "is close to a memory limit")
+@pytest.mark.vm
 def test_a_node_over_its_limit_is_killed_alone(cell: Cell, project: Project) -> None:
     """With all its processes, named with its peak and its limit, and restarted by its policy."""
     flow = project.three_nodes()
@@ -128,6 +129,7 @@ for event in node:
 
 
 @pytest.mark.warns("is close to a memory limit")
+@pytest.mark.vm
 def test_memory_that_gets_short_is_reported_once(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     project.write("sink.py", HOARD)
@@ -145,6 +147,7 @@ LIMITED = (
 )
 
 
+@pytest.mark.emulator
 def test_limits_are_what_the_kernel_holds_up(cell: Cell, project: Project) -> None:
     flow = slow_flow(project)
     project.write("dataflow.systemd.yml", "nodes: {source: {memory_limit: 1G}}\nmemory_high: 2G\n")
@@ -166,6 +169,7 @@ def test_limits_are_what_the_kernel_holds_up(cell: Cell, project: Project) -> No
     assert "/1.5G" in cell.doractl("list").stdout
 
 
+@pytest.mark.vm
 def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> None:
     flow = slow_flow(project)
     cell.start(flow, "--enable", "--node-limit=sink:memory=1G,cpu-weight=30")
@@ -205,6 +209,7 @@ def check_lifted(cell: Cell) -> None:
 
 
 @pytest.mark.warns("oom", "OOM", "killed", "failed", "Failed", "Memory", "memory", "exited")
+@pytest.mark.vm
 def test_a_limit_that_kills_the_supervisor_process_is_named(cell: Cell, project: Project) -> None:
     flow = project.write("dataflow.yml", ALONE)
     project.write("sink.py", "from dora import Node\nfor event in Node():\n    pass\n")
@@ -226,7 +231,7 @@ def test_a_limit_that_kills_the_supervisor_process_is_named(cell: Cell, project:
 
 
 def slow_flow(project: Project) -> Path:
-    """Three nodes with so few messages that an emulated and limited machine keeps up."""
+    """Three nodes with so few messages that a slow and limited machine keeps up."""
     flow = project.three_nodes()
     flow.write_text(flow.read_text().replace(TICK, "dora/timer/millis/500"))
     return flow
@@ -261,6 +266,7 @@ for event in node:
 """
 
 
+@pytest.mark.emulator
 def test_devices_and_realtime(cell: Cell, project: Project) -> None:
     flow = project.write("dataflow.yml", ALONE)
     project.write("sink.py", LOOK)
@@ -283,6 +289,7 @@ while True:
 
 
 @pytest.mark.warns("grace period", "killed on drop", "node exited with error")
+@pytest.mark.vm
 def test_a_busy_node_has_its_share(cell: Cell, project: Project) -> None:
     flow = project.write("dataflow.yml", ALONE)
     project.write("sink.py", SPIN)

@@ -253,7 +253,7 @@ def test_cpus_without_a_controller(cell: Cell, project: Project) -> None:
     assert of_node(cell, "sink").cpus == {0}
 
 
-@pytest.mark.vm
+@pytest.mark.emulator
 def test_cpus_of_a_running_node(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes(), "--node-limit=sink:cpus=0")
     files = cell.group / "node-sink"

@@ -339,7 +339,7 @@ def test_a_unit_file_is_the_same(cell: Cell, project: Project, place: Path) -> N
 @pytest.fixture
 def device() -> Iterator[Path]:
     """A device that no policy opens by itself."""
-    there = [Path(one) for one in ("/dev/net/tun", "/dev/fuse", "/dev/loop-control")]
+    there = [Path(one) for one in ("/dev/net/tun", "/dev/fuse", "/dev/loop-control", "/dev/ubda")]
     path = next(one for one in there if one.exists())
     mode = path.stat().st_mode
     path.chmod(0o666)

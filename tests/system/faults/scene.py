@@ -28,7 +28,7 @@ nodes:
     inputs: {{number: {{source: doubler/number, queue_size: 1000}}}}{more}
 """
 IS_VM = os.environ.get("LAB") == "vm"
-"""An emulated processor: about ten times slower."""
+"""A kernel in user mode: programs start about four times slower."""
 
 
 def health(seconds: int) -> str:

@@ -58,7 +58,7 @@ def robot(project: Project) -> Path:
     )
 
 
-@pytest.mark.vm
+@pytest.mark.emulator
 @pytest.mark.usefixtures("rule")
 def test_a_device_is_plugged_in_and_unplugged_and_plugged_in(cell: Cell, project: Project) -> None:
     cell.start(robot(project), "--device", "char-hidraw")

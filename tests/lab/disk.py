@@ -1,0 +1,97 @@
+"""The disk of a machine: the base as a file system, and the agent that runs commands there."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+from lab import definition
+from lab.cache import Layer, ensure_locked
+from lab.errors import Stage
+from lab.image import base_layer, debian_command
+from lab.process import run_logged
+
+SIZE = "6G"
+NAME = "root.ext4"
+SOURCES = ("disk.py", "agent.py", "wire.py")
+
+AGENT_UNIT = """\
+[Unit]
+Description=Runs the commands of the lab
+[Service]
+ExecStart=/usr/bin/python3 -m lab.agent
+WorkingDirectory=/usr/local/lib
+Restart=always
+OOMScoreAdjust=-1000
+"""
+
+# The modules of a kernel in user mode lie beside it, see user_kernel.py.
+MODULES_MOUNT = """\
+[Unit]
+Description=Modules of a kernel in user mode
+ConditionVirtualization=uml
+DefaultDependencies=no
+Before=local-fs.target
+[Mount]
+What=modules
+Where=/usr/lib/modules
+Type=hostfs
+Options=ro,hostfs=/usr/lib/uml/modules
+"""
+
+
+def disk_layer(cache: Path) -> Layer:
+    sources = [definition.read_part(definition.HERE / name) for name in SOURCES]
+    key = definition.digest(definition.base_key(), kernel_key(), sources)
+    return Layer("disk", key, lambda path: build_disk(path, cache))
+
+
+def kernel_layer(cache: Path) -> Layer:
+    return Layer("kernel", kernel_key(), lambda path: build_kernel(path, cache / "build.log"))
+
+
+def kernel_key() -> str:
+    return definition.digest(definition.SUITE, definition.KERNEL)
+
+
+def build_kernel(path: Path, log: Path) -> None:
+    with Stage(definition.KERNEL):
+        command = debian_command(path, "extract", [definition.KERNEL, "busybox-static"])
+        run_logged(command, log, "download the kernel")
+
+
+def build_disk(path: Path, cache: Path) -> None:
+    base = ensure_locked(cache, base_layer(cache))
+    kernel = ensure_locked(cache, kernel_layer(cache))
+    with Stage("disk of the machine"):
+        write_extras(path / "extras", kernel)
+        write_disk(path, base, cache / "build.log")
+
+
+def write_extras(path: Path, kernel: Path) -> None:
+    """What the machine has more than the container: laid over the tree."""
+    library = path / "usr/local/lib/lab"
+    wants = path / "etc/systemd/system/multi-user.target.wants"
+    for directory in (library, wants, path / "usr/lib", path / "out"):
+        directory.mkdir(parents=True, exist_ok=True)
+    for name in ("__init__.py", "agent.py", "wire.py"):
+        shutil.copy(definition.HERE / name, library)
+    for name, text in (("lab-agent.service", AGENT_UNIT), ("usr-lib-modules.mount", MODULES_MOUNT)):
+        (wants.parent / name).write_text(text, encoding="ascii")
+        (wants / name).symlink_to(f"../{name}")
+    # No device needs it here, and it doubles the time of a boot.
+    (wants.parent / "systemd-udev-trigger.service").symlink_to("/dev/null")
+    modules = kernel / "usr/lib/modules"
+    subprocess.run(["cp", "--archive", "--link", str(modules), str(path / "usr/lib")], check=True)
+
+
+def write_disk(path: Path, base: Path, log: Path) -> None:
+    (path / "merged").mkdir()
+    script = (
+        'mount -t overlay -o "lowerdir=$1/extras:$2" overlay "$1/merged" && '
+        'mke2fs -q -t ext4 -d "$1/merged" -E lazy_itable_init=1 "$1/$3" "$4"'
+    )
+    # In a mount namespace of its own: nothing to unmount, whatever happens.
+    mount = ["unshare", "--mount", "sh", "-c", script, "sh", str(path), str(base), NAME, SIZE]
+    run_logged(mount, log, "make the disk")
+    (path / "merged").rmdir()
+    shutil.rmtree(path / "extras")
