@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.adapters.logs.held import read_held
 from dora_systemd.adapters.logs.pipes import DRAIN_LIMIT, LogPipes
 from dora_systemd.adapters.logs.source import PIPE_SIZE, fifos
 from dora_systemd.decisions.cell.counters import WHOLE_CELL, LineCount
@@ -261,6 +262,19 @@ def test_journald_restarted(tmp_path: Path) -> None:
         cell.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         cell.server.bind(str(tmp_path / "socket"))
         assert await cell.messages(3) == ["2", "3", "4"]
+
+    run(tmp_path, scenario)
+
+
+def test_what_journald_has_not_taken_outlives_the_runner(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        path = cell.paths.node_stdout("a")
+        cell.server.close()
+        (tmp_path / "socket").unlink()
+        cell.write(path, b"1\n2\n")
+        await cell.until(lambda: cell.pipes.is_busy("a"))
+        assert read_held(path) == (b"1\n2\n", 0)
 
     run(tmp_path, scenario)
 

@@ -84,6 +84,9 @@ def test_the_end_of_an_unterminated_line_is_held(source: Source, pipe: Pipe, fif
     assert texts(end.entries()) == [b"1"]
     source.batch(pipe, b"", 0.0)
     assert read_held(fifo)[0] == b"1\n", "a line ends once"
+    source.batch(pipe, write(pipe, b"2\n33\n"), 0.0)
+    source.batch(pipe, b"", 0.0)
+    assert read_held(fifo)[0] == b"1\n2\n33\n", "there is no open line"
 
 
 def test_lines_above_the_limit_are_neither_written_nor_kept(

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import pytest
+
 from dora_systemd.decisions.cell.counters import LineCount
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
@@ -41,11 +43,12 @@ def test_status_lines() -> None:
         assert format_status(one) == expected
 
 
-def test_failures_are_named_and_many_are_counted() -> None:
-    nodes = {f"n{i}": NodeStatus("failed", exit=exit_of(1)) for i in range(7)}
+@pytest.mark.parametrize(("more", "end"), [(0, ""), (1, " and 1 more"), (2, " and 2 more")])
+def test_failures_are_named_and_many_are_counted(more: int, end: str) -> None:
+    nodes = {f"n{i}": NodeStatus("failed", exit=exit_of(1)) for i in range(5 + more)}
     text = format_status(Cell(0, 0, nodes, State.RUNNING))
-    assert text.startswith("0/7 nodes running; failed: n0 (exit code 1), ")
-    assert text.endswith("n4 (exit code 1) and 2 more")
+    assert text.startswith(f"0/{5 + more} nodes running; failed: n0 (exit code 1), ")
+    assert text.endswith(f"n4 (exit code 1){end}")
 
 
 def test_stages_and_table() -> None:

@@ -1,16 +1,22 @@
 """Whole deploys in user scope."""
 
 import os
+import pwd
+import stat
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from dora_systemd import __version__
+from dora_systemd.adapters.releases.store import locked
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.releases.copy import copy_project
 from dora_systemd.verbs.releases.deploy import compare
 from dora_systemd.verbs.releases.on_trial import refuse_on_trial
+from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.releases.trial import read_standing
 from tests.unit.fakes.deploys import FLOW, UNIT, Bench
 from tests.unit.fakes.manager import options
@@ -165,6 +171,30 @@ def test_a_damaged_disk_is_told(bench: Bench) -> None:
     damaged = f"release {first.release} is damaged: a.py and 1 more changed on the disk"
     assert bench.warnings == [f"{damaged}; the new release has its own copy; check the disk"]
     assert (bench.store.tree(second.release) / "a.py").read_text() == "print()"
+
+
+def test_a_full_disk(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = SimpleNamespace(f_bavail=0, f_frsize=4096)
+    monkeypatch.setattr(os, "statvfs", lambda _path: full)
+    error = refused(bench)
+    assert error.message == f"cannot use {bench.store.path}: No space left on device"
+    assert (error.hint, error.code) == ("see df", ExitCode.FAILURE)
+    assert bench.releases == {}
+
+
+@pytest.mark.parametrize(("has_user", "mode"), [(True, 0o750), (False, 0o700)])
+def test_the_group_of_its_user_may_enter_a_release(
+    has_user: bool, mode: int, bench: Bench
+) -> None:
+    user = pwd.getpwuid(os.geteuid()) if has_user else None
+    source = find_source(bench.scope, bench.start(), False)
+    source = replace(source, plan=replace(source.plan, user=user))
+    with locked(bench.store):
+        standing = read_standing(bench.manager, bench.scope, UNIT)
+        given = bench.scope, source, bench.store, standing, 0, bench.steps.append
+        made = copy_project(bench.manager, *given).manifest
+    release = bench.store.release(made.id).stat()
+    assert (stat.S_IMODE(release.st_mode), release.st_gid) == (mode, os.getegid())
 
 
 def test_what_is_shared_is_told(bench: Bench) -> None:

@@ -1,10 +1,14 @@
 """What doractl forget removes, and what it refuses."""
 
+from pathlib import Path
+
 import pytest
 
 from dora_systemd.decisions.releases.past import REMOVED
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.releases.forget import Kept, find_kept, forget, remove_releases
+from tests.unit.fakes.journal import FakeJournal, life_record
+from tests.unit.fakes.manager import UUID
 from tests.unit.verbs.releases.test_past import A, B, C, Robot, robot, scope
 from tests.unit.verbs.releases.test_trial import UNIT
 
@@ -68,6 +72,14 @@ def test_one_release(robot: Robot) -> None:
     # What ran before is the one before that.
     robot.run(A, "doractl rollback")
     assert robot.states == ["current", "rolled-back"]
+
+
+def test_what_only_the_journal_knows(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    journal = FakeJournal(monkeypatch, tmp_path)
+    journal.write(life_record("dataflow-stopped", 17, "gone", scope=robot.scope))
+    assert find_kept(robot.manager, robot.scope, "gone") == Kept("gone", UUID, ())
 
 
 def test_what_nobody_knows(robot: Robot) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -20,13 +20,17 @@ from dora_systemd.decisions.releases.parcel import Parcel, format_parcel
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import receive
+from dora_systemd.verbs.releases.deploy import DeployRequest
 from dora_systemd.verbs.releases.receive import (
     Known,
     _fill,
     _renamed,
     _require_space,
     _require_user,
+    _source,
 )
+from dora_systemd.verbs.start.plan import StartRequest
+from tests.unit.fakes.deploys import FLOW
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.verbs.releases.test_trial import NEW as NEW_ID
 from tests.unit.verbs.releases.test_trial import store
@@ -201,6 +205,18 @@ def test_whose_code_runs_as_the_user_of_all(
     )
     assert error.hint == "name the user here that it is to run as: --uid USER, such as --uid dora"
     assert error.code is ExitCode.NO_PERMISSION
+
+
+def test_the_settings_of_a_project_count_before_anybody_may_read_it(tmp_path: Path) -> None:
+    """They say whose it is: here a user that no dataflow of a user can have."""
+    (tmp_path / "dataflow.yml").write_text(FLOW)
+    (tmp_path / "dataflow.systemd.yml").write_text("user: nobody\n")
+    lent: list[int | None] = []
+    draft = cast(Draft, SimpleNamespace(tree=tmp_path, lend=lent.append))
+    request = DeployRequest(StartRequest("", flags={"dora": "/nowhere/dora"}), 0, 3, True)
+    with pytest.raises(DoraSystemdError, match="cannot choose the user of a dataflow with --user"):
+        _source(Scope(is_user=True, uid=os.geteuid()), request, PARCEL, draft)
+    assert lent == []
 
 
 def test_warnings_name_the_project_as_its_sender_does() -> None:

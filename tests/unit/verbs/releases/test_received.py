@@ -111,6 +111,14 @@ def test_errors_name_the_project_as_the_sender_does(sender: Sender) -> None:
     assert sender.releases == {}
 
 
+def test_warnings_of_a_deploy_reach_the_sender(sender: Sender) -> None:
+    first = sender.deploy(nice="3")
+    sender.warnings.clear()
+    sender.send(FILES)
+    (warning,) = sender.warnings
+    assert warning.startswith(f"options of release {first.release} are not given any more: --nice")
+
+
 def test_a_sender_that_hangs_up_ends_the_trial(sender: Sender) -> None:
     first = sender.send(FILES)
     sender.is_gone = True

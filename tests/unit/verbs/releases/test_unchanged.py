@@ -46,6 +46,16 @@ def test_what_another_host_sends_again_runs_on(sender: Sender) -> None:
     assert (changed.former, changed.is_unchanged) == (first.release, False)
 
 
+def test_a_link_counts_by_where_it_leads(bench: Bench) -> None:
+    way = bench.project / "way"
+    way.symlink_to("a.py")
+    bench.deploy()
+    assert bench.deploy().is_unchanged
+    way.unlink()
+    way.symlink_to("dataflow.yml")
+    assert not bench.deploy().is_unchanged
+
+
 def damage(bench: Bench) -> None:
     path = bench.store.tree(*bench.releases) / "a.py"
     path.chmod(0o644)
