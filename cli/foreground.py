@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.bus.manager import Beside, Property
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.cli.parameters import print_warnings
 from dora_systemd.cli.terminal import StageLine, wants_colors
 from dora_systemd.decisions.logs.filter import LogFilter
@@ -19,10 +20,9 @@ from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.scope import scope_of
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.logs import FollowedLog, Write
-from dora_systemd.verbs.start.asked import note_request
-from dora_systemd.verbs.start.job import start_unit
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.run import SIGNALS, follow_unit
+from dora_systemd.verbs.start.start_unit import start_unit
 
 if TYPE_CHECKING:
     from dora_systemd.verbs.remote.attached import MemberLines, SharedLog

@@ -7,7 +7,7 @@ import click
 
 from dora_systemd.cli.parameters import tell
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.facts.locks import IfInhibited
 
 C = TypeVar("C", bound=Callable[..., Any])
 

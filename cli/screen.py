@@ -27,8 +27,8 @@ from dora_systemd.decisions.views.top_screen import Change, Line, TopScreen
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.terminal_text import one_line
-from dora_systemd.verbs.act import act_on
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.restart import act_on
 from dora_systemd.verbs.top import Top
 
 _ENDINGS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)

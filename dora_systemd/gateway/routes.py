@@ -11,7 +11,7 @@ from dora_systemd.decisions.views.prometheus import CONTENT_TYPE, format_metrics
 from dora_systemd.gateway.control.serve import serve_control
 from dora_systemd.gateway.live.page import talk
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.snapshot import read_snapshot
+from dora_systemd.verbs.top import read_snapshot
 
 DIRECTORY = Path(__file__).parent / "static"
 PREFIX = "/page/"

@@ -45,8 +45,7 @@ from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.account import DEFAULT_USER
 from dora_systemd.verbs.start.enable import boot_target
-from dora_systemd.verbs.start.linger import is_lingering, linger_command
-from dora_systemd.verbs.start.logins import PASSWD, judge_logins
+from dora_systemd.verbs.start.logins import PASSWD, is_lingering, judge_logins, linger_command
 from dora_systemd.verbs.start.settings import check_config, config_files
 
 JOURNALD = "systemd-journald.service"

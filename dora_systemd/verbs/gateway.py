@@ -1,12 +1,15 @@
-"""The state of the gateway as systemd knows it, and its token."""
+"""`doractl env`, and the state of the gateway as systemd knows it, and its token."""
 
 from dataclasses import dataclass
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.addresses import answers_health
+from dora_systemd.decisions.dora.variables import coordinator_variables
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT, port_of, token_path
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.node import dora_environment, reached_coordinator
 
 _READY_SECONDS = 30.0
 
@@ -65,3 +68,16 @@ def read_token(scope: Scope, port: int) -> str:
         raise DoraSystemdError(
             f"cannot read {path}", f"systemctl {scope.flag} restart {SOCKET_UNIT}"
         ) from error
+
+
+def read_variables(manager: Manager, scope: Scope, selector: str | None) -> dict[str, str]:
+    """The variables by name; with `selector` those of that dataflow instead of the gateway.
+
+    Raises DoraSystemdError: NOT_RUNNING, NOT_FOUND, NO_PERMISSION for another user's dataflow, or
+    USAGE for one with a private network.
+    """
+    if selector is None:
+        port = require_gateway(manager, scope)
+        return coordinator_variables(port, read_token(scope, port))
+    cell = Selector(selector).find(manager)
+    return dora_environment(reached_coordinator(scope, manager, cell))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.note import caller
 from dora_systemd.adapters.runner_socket import client as runner_socket
 from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.dora.coordinator import Coordinator
@@ -22,9 +23,8 @@ from dora_systemd.trust.sockets import require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import CONTROL, Cell, refuse_parts
+from dora_systemd.verbs.facts.locks import IfInhibited, Tell, require_uninhibited
 from dora_systemd.verbs.facts.reading import read_status
-from dora_systemd.verbs.inhibit.guard import IfInhibited, Tell, require_uninhibited
-from dora_systemd.verbs.start.asked import caller
 
 _NO_USER = 2**32 - 1
 """UID of a unit without User=: it runs as the manager's own user."""

@@ -1,19 +1,23 @@
-"""Restarts dataflows that systemd has loaded, unless their next start would be refused."""
+"""`doractl restart`: restarts what systemd has loaded, unless the next start would be refused.
+
+act_on() is the same for the views, which also stop.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer
+from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer, StageObserver, tell_stage
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.runner_socket.client import ask_refusal
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.cells import Cell, refuse_parts
+from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.facts.reason import job_reason, logs_hint, need_failure, runners_refusal
-from dora_systemd.verbs.node import socket_of
-from dora_systemd.verbs.stop import THAWED, note_stop
+from dora_systemd.verbs.node import NodeOrder, order_node, socket_of
+from dora_systemd.verbs.stop import THAWED, find_dependents, note_stop, stop_cells
 
 Ask = Callable[[Path], DoraSystemdError | None]
 """The error with which the runner at a path would refuse to start again."""
@@ -93,3 +97,41 @@ def _outcome(manager: Manager, scope: Scope, cell: Cell, result: str, was_frozen
         reason = job_reason(manager, cell.unit, result)
         hint = logs_hint(scope.flag, cell.name, reason)
     return Outcome(cell, "", f"cannot restart {cell.name}: {reason}", hint=hint)
+
+
+def act_on(
+    manager: Manager,
+    scope: Scope,
+    cell: Cell,
+    node: str,
+    action: str,
+    *,
+    by: str,
+    on_stage: StageObserver | None = None,
+) -> str:
+    """Stop or restart a dataflow, or one of its nodes; what was done, in one line.
+
+    node: "" is the whole dataflow. action: "stop" or "restart". by: the view, for the journal.
+    on_stage: called with each stage of a dataflow. Raises DoraSystemdError as the verbs of doractl
+    do.
+    """
+    refuse_parts([cell], action)
+    if node:
+        return order_node(scope, cell, NodeOrder(action, node, by))
+    observer = partial(tell_stage, on_stage)
+    cells = [cell, *find_dependents(manager, [cell])]
+    if action == "stop":
+        note_stop(cells, by)
+        outcomes = stop_cells(manager, scope, cells, observer)
+    else:
+        with uninhibited(scope, cells, "restart"):
+            outcomes = restart_cells(manager, scope, cells, by, observer=observer)
+    return "; ".join(map(told, outcomes))
+
+
+def told(outcome: Outcome) -> str:
+    """What was done. Raises DoraSystemdError for a problem."""
+    if outcome.problem:
+        hint = outcome.hint or f"doractl why {outcome.subject.name}"
+        raise DoraSystemdError(outcome.problem, hint, outcome.code)
+    return outcome.text

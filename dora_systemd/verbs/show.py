@@ -1,11 +1,14 @@
-"""`doractl show`: the unit of a dataflow, from the files that systemd has."""
+"""`doractl show` and `export`: the unit of a dataflow, from the files that systemd has."""
 
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.files import decoded
+from dora_systemd.decisions.unit.file import persistent_unit, plain_target
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.start.enable import no_unit_file, refuse_attached
 
 _PROPERTIES = ("FragmentPath", "DropInPaths")
 
@@ -34,3 +37,12 @@ def _read(path: str) -> str:
             "use sudo" if isinstance(error, PermissionError) else "systemctl daemon-reload",
             ExitCode.NO_PERMISSION if isinstance(error, PermissionError) else ExitCode.FAILURE,
         ) from error
+
+
+def export_cell(manager: Manager, scope: Scope, cell: Cell) -> str:
+    """The unit as one file, with its drop-ins in it. Raises DoraSystemdError."""
+    refuse_attached(cell)
+    if cell.options.placed:
+        raise no_unit_file(cell.name, "it runs on several machines")
+    texts = list(unit_files(manager, cell).values())
+    return persistent_unit(texts, cell.options, scope.is_user, plain_target(scope.is_user))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager, Observer, is_at_rest
+from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.outcome import Outcome, Subject
 from dora_systemd.errors import DoraSystemdError
@@ -15,10 +16,9 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists
 from dora_systemd.values import INFINITY, SECOND, format_duration
 from dora_systemd.verbs.facts.budget import read_restarts
-from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, own_directories, trial_path
 from dora_systemd.verbs.facts.reason import failure_reason
-from dora_systemd.verbs.start.asked import note_request
 
 UNBOUNDED_SECONDS = 90.0
 """Timeout for a dataflow with TimeoutStopSec=infinity: systemd's own default."""
@@ -174,7 +174,7 @@ def end_links_of(manager: Manager, cells: Sequence[Cell]) -> None:
     heads = [one.name for one in known if one and one.placed and not one.machine]
     if heads:
         # Imported late: most dataflows run on one machine.
-        from dora_systemd.verbs.start.claim import end_links
+        from dora_systemd.verbs.start.start import end_links
 
         for name in heads:
             end_links(manager, name)
@@ -280,3 +280,26 @@ def _ended(manager: Manager, one: _Stop, state: str) -> Ended:
 
 def _joined(*notes: str) -> str:
     return ", ".join(filter(None, notes))
+
+
+def find_dependents(manager: Manager, cells: Sequence[Cell]) -> list[Cell]:
+    """The running dataflows that need one of `cells`, or need one that does, without `cells`."""
+    needed, waiting = {cell.unit for cell in cells}, [cell.unit for cell in cells if cell.is_up]
+    found: set[str] = set()
+    while waiting:
+        by = set(manager.read(waiting.pop(), ["RequiredBy"])["RequiredBy"] or ())
+        new = by - found - needed
+        found |= new
+        waiting += sorted(new)
+    if not found:
+        return []
+    return proven(one for one in read_cells(manager) if one.unit in found and one.is_up)
+
+
+def format_dependents(needed: Sequence[Subject], dependents: Sequence[Subject]) -> str:
+    """As "needy needs base and ends with it"; "" without any."""
+    if not dependents:
+        return ""
+    names, bases = (", ".join(one.name for one in some) for some in (dependents, needed))
+    verb, end = ("needs", "ends") if len(dependents) == 1 else ("need", "end")
+    return f"{names} {verb} {bases} and {end} with {'it' if len(needed) == 1 else 'them'}"

@@ -1,14 +1,23 @@
-"""`doractl version`: the versions of doractl, Python, systemd and dora."""
+"""`doractl version`: the versions of doractl, Python, systemd and dora.
+
+own_facts() is what this machine says of itself to a head that may want it as a member.
+"""
 
 import os
 import platform
+import sys
+import time
 from collections.abc import Callable
+from pathlib import Path
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.dora.command import dora_version, find_dora
+from dora_systemd.decisions.machines.facts import Facts
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import user_name
+from dora_systemd.verbs.start.logins import is_lingering
 
 
 def read_versions(scope: Scope) -> dict[str, str | None]:
@@ -27,3 +36,16 @@ def _found(read: Callable[[], str]) -> str | None:
         return read()
     except DoraSystemdError:
         return None
+
+
+def own_facts(scope: Scope) -> Facts:
+    """Of the caller's account."""
+    versions = read_versions(scope)
+    return Facts(
+        doractl=versions["doractl"] or "",
+        dora=versions["dora"] or "",
+        program=str(Path(sys.argv[0]).absolute()),
+        user=user_name(os.getuid()),
+        linger=not scope.is_user or is_lingering(scope) is not False,
+        now=time.time_ns() // 1000,
+    )

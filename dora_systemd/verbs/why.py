@@ -30,7 +30,7 @@ from dora_systemd.verbs.facts.lives import now_boot, read_lives
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.facts.whole import read_whole_rows
+from dora_systemd.verbs.list import read_whole_rows
 
 _MOST_SHUTDOWNS = 20
 WORDS_OF_START = 10

@@ -52,7 +52,7 @@ KEPT = (
     Kept("decisions/logs/events", r"EventKind\(", "the table is made before there is a mutant"),
     Kept("decisions/logs/terminal", r"times >= 1:", "once is no repetition, see repeated()"),
     Kept("", r"too_many\(None\)", "the project has no path, as ''"),
-    Kept("verbs/releases/built_files", r"in range\(len\(parts\)\)", "no file has the path ''"),
+    Kept("verbs/releases/build", r"in range\(len\(parts\)\)", "no file has the path ''"),
     Kept(
         *("verbs/releases/change", r"end_killed\(Bus|_end_alone|read_life\(manager, None"),
         "a child does this after a kill: tests/system/deploy/kills.py",

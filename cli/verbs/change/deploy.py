@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.adapters.releases.incoming import Stream
+from dora_systemd.adapters.releases.transfer import Stream
 from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import (
     acting_options,
@@ -33,8 +33,7 @@ from dora_systemd.verbs.releases.deploy import (
     deploy,
 )
 from dora_systemd.verbs.releases.receive import compare_sent, receive
-from dora_systemd.verbs.start.linger import ensure_linger
-from dora_systemd.verbs.start.logins import logout_note
+from dora_systemd.verbs.start.logins import ensure_linger, logout_note
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest
 
 _INPUT = 0

@@ -7,7 +7,7 @@ from dora_systemd.cli.parameters import acting_options, current_scope, print_out
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import find_all
-from dora_systemd.verbs.releases.on_trial import refuse_on_trial
+from dora_systemd.verbs.releases.listing import refuse_on_trial
 from dora_systemd.verbs.start.enable import disable_cell
 
 

@@ -12,9 +12,9 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import find_all
-from dora_systemd.verbs.releases.on_trial import refuse_on_trial
+from dora_systemd.verbs.releases.listing import refuse_on_trial
 from dora_systemd.verbs.start.enable import BootUnit, enable_cell
-from dora_systemd.verbs.start.linger import ensure_linger
+from dora_systemd.verbs.start.logins import ensure_linger
 
 
 @click.command("enable")

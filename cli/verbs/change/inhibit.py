@@ -22,7 +22,7 @@ from dora_systemd.decisions.views.inhibitors import (
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.inhibit.hold import hold, inhibited_dataflows, take_inhibiting
+from dora_systemd.verbs.inhibit import hold, inhibited_dataflows, take_inhibiting
 
 
 @click.command("inhibit")

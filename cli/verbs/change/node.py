@@ -12,8 +12,8 @@ from dora_systemd.cli.parameters import (
 )
 from dora_systemd.decisions.cell.asked import RESTART, STOP
 from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.inhibit.guard import IfInhibited
 from dora_systemd.verbs.node import NodeOrder, order_node
 
 _DOORS = {RESTART: "doractl node restart", STOP: "doractl node stop"}

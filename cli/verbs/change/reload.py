@@ -6,8 +6,8 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.verbs.facts.locks import require_uninhibited
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.inhibit.guard import require_uninhibited
 from dora_systemd.verbs.reload import reload_cell
 
 

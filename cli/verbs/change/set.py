@@ -19,7 +19,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import require_running
-from dora_systemd.verbs.releases.on_trial import refuse_on_trial
+from dora_systemd.verbs.releases.listing import refuse_on_trial
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
 

@@ -5,8 +5,8 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.export import export_cell
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.show import export_cell
 
 
 @click.command("export")

@@ -18,8 +18,8 @@ from dora_systemd.verbs.destroy import (
     stop_slice,
 )
 from dora_systemd.verbs.facts.enabled import enabled_names
+from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.gateway import read_gateway
-from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.stop import note_stop
 
 

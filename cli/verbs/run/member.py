@@ -20,16 +20,16 @@ from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
-from dora_systemd.verbs.machines.head import Head
 from dora_systemd.verbs.machines.member import (
+    Head,
     MemberRequest,
     become_relay,
     is_passing,
     start_member,
 )
-from dora_systemd.verbs.machines.own import own_facts
 from dora_systemd.verbs.machines.push import place_problem
 from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.version import own_facts
 
 _FORCED = "dora_systemd.member.forced"
 

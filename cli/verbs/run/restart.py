@@ -12,10 +12,10 @@ from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
 from dora_systemd.cli.terminal import StageLine
 from dora_systemd.verbs.facts.cells import refuse_parts
-from dora_systemd.verbs.inhibit.guard import uninhibited
-from dora_systemd.verbs.needs.dependents import find_dependents, format_dependents
+from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.restart import restart_cells
-from dora_systemd.verbs.start.again import find_known
+from dora_systemd.verbs.start.restart_ended import find_known
+from dora_systemd.verbs.stop import find_dependents, format_dependents
 
 
 @click.command("restart")
@@ -45,7 +45,7 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
         observer = partial(tell_stage, stage)
         outcomes = restart_cells(bus, scope, cells, "doractl restart", force, observer)
         if ended:
-            from dora_systemd.verbs.start.launch import restart_asked
+            from dora_systemd.verbs.start.start import restart_asked
 
             outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]
     if any(one.problem for one in outcomes):

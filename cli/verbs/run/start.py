@@ -28,18 +28,15 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.needs.notes import held_notes, waiting_notes
-from dora_systemd.verbs.start.again import find_start, means_name
 from dora_systemd.verbs.start.check import check_plan
-from dora_systemd.verbs.start.claim import require_free_name
 from dora_systemd.verbs.start.enable import boot_target
-from dora_systemd.verbs.start.job import Started, format_started, start_unit
-from dora_systemd.verbs.start.launch import Claim, claim
-from dora_systemd.verbs.start.linger import ensure_linger
-from dora_systemd.verbs.start.logins import has_run_here, logout_note, start_notes
+from dora_systemd.verbs.start.logins import ensure_linger, has_run_here, logout_note, start_notes
+from dora_systemd.verbs.start.needs import held_notes, waiting_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
-from dora_systemd.verbs.start.unit import format_plan
-from dora_systemd.verbs.start.watch import watched_patterns
+from dora_systemd.verbs.start.restart_ended import find_start, means_name
+from dora_systemd.verbs.start.start import Claim, claim, require_free_name
+from dora_systemd.verbs.start.start_unit import Started, format_started, start_unit
+from dora_systemd.verbs.start.unit import format_plan, watched_patterns
 
 
 @click.command("start", cls=SettingsCommand)

@@ -25,8 +25,14 @@ from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells, refuse_parts, without_parts
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
-from dora_systemd.verbs.needs.dependents import find_dependents, format_dependents
-from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within
+from dora_systemd.verbs.stop import (
+    find_dependents,
+    format_dependents,
+    not_running,
+    note_stop,
+    stop_cells,
+    stop_cells_within,
+)
 
 
 @click.command("stop")

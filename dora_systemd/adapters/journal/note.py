@@ -1,10 +1,18 @@
 """Sends one record to the journal from a process that writes no others; loads less than `socket`.
 
+So requests are recorded: systemd notes no caller, and forgets what it has unloaded.
+
 journald adds the user of the process, see _UID in systemd.journal-fields(7).
 """
 
+import os
 import socket
+from collections.abc import Mapping
 from contextlib import suppress
+
+from dora_systemd.decisions.logs.events import event_fields
+from dora_systemd.decisions.logs.fields import encode_entry
+from dora_systemd.trust.paths import user_name
 
 JOURNAL_SOCKET = "/run/systemd/journal/socket"
 
@@ -16,3 +24,26 @@ def send_note(entry: bytes, path: str = JOURNAL_SOCKET) -> None:
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sock,
     ):
         sock.sendto(entry, path)
+
+
+def note_request(event: str, name: str, uuid: str, command: str, **details: str) -> None:
+    """Write an event about a dataflow in the name of this process.
+
+    command: by which it is asked, such as "doractl stop". details: as in event_fields().
+    """
+    by = requester(command)
+    fields = event_fields(event, dataflow=name, by=by, **details)
+    own = {"DORA_DATAFLOW": uuid, "DORA_DATAFLOW_NAME": name, "SYSLOG_IDENTIFIER": "doractl"}
+    send_note(encode_entry({**fields, **own}))
+
+
+def requester(command: str) -> str:
+    """Who asks in this process, and by which command, as in "root (doractl stop)"."""
+    return f"{caller(os.getuid(), os.environ)} ({command})"
+
+
+def caller(uid: int, environ: Mapping[str, str]) -> str:
+    """A user's name; root by sudo(8) is told with the one who called it."""
+    name = user_name(uid, nameless="the user ")
+    behind = environ.get("SUDO_USER", "")
+    return f"{name}, by sudo of {behind}" if uid == 0 and behind not in ("", "root") else name

@@ -29,9 +29,9 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import shown
 from dora_systemd.verbs.facts.nodes import written_dataflow
-from dora_systemd.verbs.start.job import start_unit
-from dora_systemd.verbs.start.launch import claim
 from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.start import claim
+from dora_systemd.verbs.start.start_unit import start_unit
 
 _SUFFIXES = (".yml", ".yaml")
 _MOST_FILES = 200

@@ -17,11 +17,10 @@ from dora_systemd.gateway.control.state import ended_result
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
+from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.inhibit.guard import uninhibited
-from dora_systemd.verbs.needs.dependents import find_dependents
 from dora_systemd.verbs.restart import require_startable, restart_cells
-from dora_systemd.verbs.stop import note_stop, stop_cells
+from dora_systemd.verbs.stop import find_dependents, note_stop, stop_cells
 
 _FORCE_SECONDS = 0.2
 """Time for systemd to begin the stop: a kill before that would count as a failure."""

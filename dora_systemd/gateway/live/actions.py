@@ -18,19 +18,19 @@ from dora_systemd.decisions.gateway.page_messages import HOT_RELOAD, PageMessage
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
-from dora_systemd.verbs.act import act_on, told
 from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.locks import require_uninhibited
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.inhibit.guard import require_uninhibited
 from dora_systemd.verbs.node import ask_coordinator
 from dora_systemd.verbs.reload import reload_cell, switch_hot_reload
+from dora_systemd.verbs.restart import act_on, told
 from dora_systemd.verbs.set import set_limits
-from dora_systemd.verbs.start.again import find_start
 from dora_systemd.verbs.start.enable import disable_cell, enable_cell
-from dora_systemd.verbs.start.launch import restart_asked
-from dora_systemd.verbs.start.linger import ensure_linger
+from dora_systemd.verbs.start.logins import ensure_linger
+from dora_systemd.verbs.start.restart_ended import find_start
+from dora_systemd.verbs.start.start import restart_asked
 
 _LONGER = 30 * SECOND
 """µs from each step of an action on that systemd gives the gateway to end, if it has to. Without
@@ -161,7 +161,7 @@ def _set(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> st
 
 def _refuse_on_trial(scope: Scope, cell: Cell, verb: str) -> None:
     # Imported late: few change a unit, and its imports are memory.
-    from dora_systemd.verbs.releases.on_trial import refuse_on_trial
+    from dora_systemd.verbs.releases.listing import refuse_on_trial
 
     refuse_on_trial(scope, cell, verb)
 

@@ -33,7 +33,7 @@ from dora_systemd.gateway.live.lines import (
 )
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
-from dora_systemd.verbs.facts.snapshot import read_snapshot
+from dora_systemd.verbs.top import read_snapshot
 
 INTERVAL_SECONDS = 2.0
 LONGEST_SECONDS = 10.0

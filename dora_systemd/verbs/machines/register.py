@@ -22,9 +22,9 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
 from dora_systemd.trust.programs import own_account
 from dora_systemd.values import quoted, shown
-from dora_systemd.verbs.machines.own import own_facts
 from dora_systemd.verbs.machines.probe import Probe, probe_as_caller, probe_as_link, run_there
 from dora_systemd.verbs.start.settings import config_file, key_place, read_config
+from dora_systemd.verbs.version import own_facts
 
 _INSTALL = (
     'umask 077; mkdir -p "$HOME/.ssh" && f="$HOME/.ssh/authorized_keys" && touch "$f" && '

@@ -15,6 +15,7 @@ from dora_systemd.adapters.bus.manager import SETTLED, UP, Manager, Observer
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.host.guard import SIGNALS, guarded
 from dora_systemd.adapters.host.unit_files import remove_unit_file
+from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.logs.events import ROLLED_BACK
@@ -26,21 +27,22 @@ from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
-from dora_systemd.verbs.inhibit.guard import IfInhibited, uninhibited
-from dora_systemd.verbs.releases.past import KILLED, note_fault, note_run
+from dora_systemd.verbs.facts.locks import IfInhibited, uninhibited
 from dora_systemd.verbs.releases.soak import START_LIMIT, Gate, Tell, settle
 from dora_systemd.verbs.releases.trial import (
+    KILLED,
     Standing,
     begin_trial,
     commit,
     end_trial,
     go_back,
+    note_fault,
+    note_run,
     read_after_wait,
     read_life,
     read_standing,
 )
-from dora_systemd.verbs.start.asked import note_request
-from dora_systemd.verbs.start.claim import make_room
+from dora_systemd.verbs.start.start import make_room
 
 
 @dataclass(frozen=True)

@@ -10,25 +10,24 @@ from typing import NamedTuple
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked, unusable
 from dora_systemd.decisions.releases.choice import surplus
-from dora_systemd.decisions.releases.entries import of_project, touched
+from dora_systemd.decisions.releases.entries import FILE, LINK, Found, Stored, of_project, touched
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.settings.lost import lost_options
 from dora_systemd.decisions.settings.resolve import given_texts
-from dora_systemd.decisions.unit.file import runner_of, user_of
+from dora_systemd.decisions.unit.file import persistent_unit, runner_of, user_of, with_boot_check
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import opened_project
 from dora_systemd.values import SECOND, shown
-from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
+from dora_systemd.verbs.facts.locks import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.build import clean
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.copy import copy_project, newest, repository_owners
 from dora_systemd.verbs.releases.files import digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
-from dora_systemd.verbs.releases.past import read_past
 from dora_systemd.verbs.releases.soak import Gate, Tell
 from dora_systemd.verbs.releases.source import (
     Source,
@@ -40,14 +39,15 @@ from dora_systemd.verbs.releases.source import (
 from dora_systemd.verbs.releases.trial import (
     Standing,
     read_after_wait,
+    read_past,
     read_standing,
     require_deployable,
 )
-from dora_systemd.verbs.releases.unchanged import find_unchanged, unit_text
 from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import check_plan
-from dora_systemd.verbs.start.claim import require_same_user
-from dora_systemd.verbs.start.plan import StartRequest, make_plan
+from dora_systemd.verbs.start.enable import boot_target
+from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.start import require_same_user
 from dora_systemd.verbs.start.unit import plan_properties
 
 _COMMAND = "doractl deploy"
@@ -274,3 +274,62 @@ def _at_source(
     if source.dora and "dora build" in hint:
         hint = "the build has to make it there"
     return DoraSystemdError(message, hint, error.code)
+
+
+def find_unchanged(
+    manager: Manager,
+    scope: Scope,
+    source: Source,
+    store: Store,
+    standing: Standing,
+    request: StartRequest,
+) -> Manifest | None:
+    """Find the release that runs, if it has the files and the settings of `source`.
+
+    request: of the deploy. None also if that cannot be told: then the deploy reports why.
+    """
+    release = standing.current
+    if source.is_moving or not _runs(standing, release) or not store.is_proved(release):
+        return None
+    try:
+        manifest, tree = store.manifest(release), store.tree(release)
+        if not _has_files_of(source, manifest):
+            return None
+        require_same(source, tree)
+        plan = make_plan(scope, released(source, request, tree, manifest.uuid))
+        text = unit_text(manager, scope, plan, format_unit(plan_properties(plan, manager)[0]))
+        has_unit = standing.boot.text in (text, with_boot_check(text))
+        return manifest if has_unit and store.intact(manifest) == manifest.files else None
+    except (DoraSystemdError, OSError):
+        return None
+
+
+def unit_text(manager: Manager, scope: Scope, plan: Plan, text: str) -> str:
+    """Make the unit file of a plan from the text of its transient unit."""
+    target = boot_target(manager, scope)
+    return persistent_unit([text], plan.options, scope.is_user, target)
+
+
+def _runs(standing: Standing, release: str) -> bool:
+    """Whether every start runs that release, and it runs now."""
+    cell = standing.cell
+    is_up = cell is not None and cell.state.active == "active" and cell.release == release
+    return bool(release and not standing.trial and is_up)
+
+
+def _has_files_of(source: Source, manifest: Manifest) -> bool:
+    """Whether the release has been made from the files that the project has now."""
+    known = of_project(manifest.files)
+    with opened_project(source.root, account_of(source.plan.user)) as project:
+        found, _ = find_files(project, source.named, repository_owners(source))
+        # The content is read last, and only if all else is the same.
+        is_alike = found.keys() == known.keys() and all(
+            _is_alike(one, known[path]) for path, one in found.items()
+        )
+        return is_alike and digests(project, found) == known
+
+
+def _is_alike(one: Found, known: Stored) -> bool:
+    if one.kind == LINK or known.target:
+        return one.target == known.target
+    return (one.kind, one.size, one.is_executable) == (FILE, known.size, known.is_executable)

@@ -5,6 +5,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import FORGOTTEN
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -15,9 +16,7 @@ from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.releases.build import clean
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
-from dora_systemd.verbs.releases.past import note_removal
-from dora_systemd.verbs.releases.trial import Standing, read_standing
-from dora_systemd.verbs.start.asked import note_request
+from dora_systemd.verbs.releases.trial import Standing, note_removal, read_standing
 
 _COMMAND = "doractl forget"
 

@@ -5,19 +5,25 @@ from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.releases.incoming import leftovers
 from dora_systemd.adapters.releases.store import Store, is_locked, store_root
+from dora_systemd.adapters.releases.transfer import leftovers
 from dora_systemd.decisions.releases.choice import UNKNOWN, UNPROVED, Known, state_of
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import Switch, begins, ends, marks
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.decisions.views.releases import ReleaseRow
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.names import is_name, unit_name
+from dora_systemd.names import is_name, release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import list_directory
-from dora_systemd.verbs.releases.past import read_past
-from dora_systemd.verbs.releases.trial import Standing, read_standing, remains
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.releases.trial import (
+    Standing,
+    read_past,
+    read_standing,
+    remains,
+    trial_options,
+)
 
 _MOST_NAMES = 10_000
 
@@ -100,3 +106,16 @@ def _judge(manager: Manager, scope: Scope, name: str) -> Iterator[Finding]:
     for path in () if is_locked(store) else remains(store, standing):
         text = f"{path} is the rest of a deploy that was killed"
         yield Finding("releases", State.NOTE, text, "the next deploy removes it")
+
+
+def refuse_on_trial(scope: Scope, cell: Cell, verb: str) -> None:
+    """Raise DoraSystemdError if a deploy or rollback tries a release of the dataflow now.
+
+    What it commits, or goes back to, would undo half of what `verb` does to the unit.
+    """
+    options = trial_options(scope, cell.unit)
+    if options and is_locked(store_of(scope, cell.name)):
+        raise DoraSystemdError(
+            f"cannot {verb} {cell.name}: release {release_of(options.dataflow)} is on trial",
+            f"wait until that has ended; doractl releases {cell.name} shows it",
+        )

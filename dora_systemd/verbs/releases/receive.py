@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.draft import Draft
-from dora_systemd.adapters.releases.incoming import Stream, incoming
 from dora_systemd.adapters.releases.store import Store, unusable
+from dora_systemd.adapters.releases.transfer import Stream, incoming
 from dora_systemd.decisions.releases.entries import Stored, of_project, touched
 from dora_systemd.decisions.releases.parcel import (
     MOST_HEAD,
@@ -32,7 +32,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
-from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
+from dora_systemd.verbs.facts.locks import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.copy import newest
 from dora_systemd.verbs.releases.deploy import (
     Deployed,

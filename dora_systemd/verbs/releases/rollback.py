@@ -3,6 +3,7 @@
 from functools import partial
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.choice import before
@@ -15,22 +16,23 @@ from dora_systemd.names import did_you_mean, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted, shown
+from dora_systemd.verbs.facts.locks import IfInhibited, require_uninhibited
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.build import clean
 from dora_systemd.verbs.releases.change import Change, change_release, stop_observer
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
-from dora_systemd.verbs.releases.past import KILLED, note_fault, read_past
 from dora_systemd.verbs.releases.soak import Gate, Tell
 from dora_systemd.verbs.releases.trial import (
+    KILLED,
     Standing,
     go_back,
+    note_fault,
     read_after_wait,
+    read_past,
     read_standing,
     require_deployable,
 )
-from dora_systemd.verbs.start.asked import note_request
 
 _COMMAND = "doractl rollback"
 

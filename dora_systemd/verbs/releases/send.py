@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from dora_systemd.adapters.releases.spool import Spool, spooled
+from dora_systemd.adapters.releases.transfer import Spool, spooled
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.releases.entries import Found, Stored, refusal
 from dora_systemd.decisions.releases.parcel import Parcel

@@ -1,4 +1,6 @@
-"""Warns about other users of the machine: they can reach dora's ports on the host's network.
+"""Warns about a logout, which ends what a user has started, and about other users who log in.
+
+Other users can reach dora's ports on the host's network.
 
 Nodes and daemon of dora 1.1 use TCP on 127.0.0.1 without authentication. Only firewall rules for
 the whole machine could filter by user; those of a unit (IPAddressDeny=, SocketBindDeny=) filter
@@ -9,12 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dora_systemd.adapters.host.files import read_text
+from dora_systemd.adapters.host.process import run_command
 from dora_systemd.decisions.settings.sandbox import NETWORK
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import RUNTIME_NAME, Scope
-from dora_systemd.trust.paths import exists
-from dora_systemd.verbs.start.linger import linger_note
+from dora_systemd.trust.paths import exists, user_name
 from dora_systemd.verbs.start.plan import Plan
 
 PASSWD = Path("/etc/passwd")
@@ -24,6 +26,8 @@ _LOGINS = range(1000, 65534)
 
 _NO_SHELLS = ("nologin", "false", "true", "sync")
 _SHOWN = 3
+_SECONDS = 20.0
+_LOGINCTL = ("loginctl", "--no-ask-password")
 
 
 def login_users(passwd: str) -> list[str]:
@@ -92,3 +96,51 @@ def _logins(passwd: Path) -> list[str]:
 def _names(users: list[str]) -> str:
     more = len(users) - _SHOWN
     return ", ".join(users[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def is_lingering(scope: Scope) -> bool | None:
+    """Whether the manager of the scope's user starts at boot; None if logind does not answer."""
+    command = (*_LOGINCTL, "show-user", "--property=Linger", "--value", str(scope.uid))
+    try:
+        answer = run_command(command, _SECONDS).stdout.strip()
+    except DoraSystemdError:
+        return None
+    return {"yes": True, "no": False}.get(answer)
+
+
+def linger_command(scope: Scope) -> str:
+    """The command by which root enables lingering."""
+    return f"loginctl enable-linger {_user_name(scope)}"
+
+
+def ensure_linger(scope: Scope) -> str:
+    """Enable lingering for the user; a message about that, or "".
+
+    On most machines polkit lets users do that for themselves.
+    """
+    if not scope.is_user or is_lingering(scope):
+        return ""
+    try:
+        done = run_command((*_LOGINCTL, "enable-linger", str(scope.uid)), _SECONDS)
+    except DoraSystemdError:
+        done = None
+    if done is not None and done.status == 0:
+        return f"lingering is now on for {_user_name(scope)}: dataflows start at boot, not at login"
+    return (
+        f"it will start when {_user_name(scope)} logs in, not at boot; "
+        f"for that, as root: {linger_command(scope)}"
+    )
+
+
+def linger_note(scope: Scope) -> str:
+    """A warning that the dataflow ends at logout, or ""."""
+    if not scope.is_user or is_lingering(scope) is not False:
+        return ""
+    return (
+        f"it ends when {_user_name(scope)} logs out; "
+        f"to keep it running, as root: {linger_command(scope)}"
+    )
+
+
+def _user_name(scope: Scope) -> str:
+    return user_name(scope.uid, nameless="")

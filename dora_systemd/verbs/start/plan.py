@@ -34,9 +34,12 @@ from dora_systemd.trust.paths import Place, exists
 from dora_systemd.trust.sight import sight_of
 from dora_systemd.values import shown
 from dora_systemd.verbs.start.account import account_of, choose_user
-from dora_systemd.verbs.start.credentials import check_credentials, credential_files
-from dora_systemd.verbs.start.notes import plan_notes
-from dora_systemd.verbs.start.places import Look
+from dora_systemd.verbs.start.find_files import (
+    Look,
+    check_credentials,
+    credential_files,
+    plan_notes,
+)
 from dora_systemd.verbs.start.sandbox import make_sandbox
 from dora_systemd.verbs.start.settings import read_settings
 

@@ -9,6 +9,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.properties.assignments import with_properties
 from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, unmatched_patterns
 from dora_systemd.decisions.settings.limits import DEVICE
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.runner_options import idle_warnings
@@ -17,16 +18,15 @@ from dora_systemd.decisions.unit.properties import UnitContext, format_unit, uni
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
 from dora_systemd.paths import CellPaths
 from dora_systemd.trust.paths import exists
-from dora_systemd.verbs.needs.check import Needy, check_needs
-from dora_systemd.verbs.needs.notes import clock_service, needs_warnings
-from dora_systemd.verbs.start.credentials import credential_files
+from dora_systemd.values import quoted
+from dora_systemd.verbs.start.find_files import credential_files
 from dora_systemd.verbs.start.limits import check_limits
+from dora_systemd.verbs.start.needs import Needy, check_needs, clock_service, needs_warnings
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.sandbox import sandbox_warnings
 from dora_systemd.verbs.start.settings import key_place
-from dora_systemd.verbs.start.watch import watch_warnings
 
-if TYPE_CHECKING:  # most dataflows run on one machine
+if TYPE_CHECKING:
     from dora_systemd.decisions.machines.link_unit import LinkUnit
 
 
@@ -107,3 +107,30 @@ def _properties(plan: Plan) -> dict[str, Property]:
 
         return with_properties(properties, wanted_links(plan.options))
     return properties
+
+
+def watched_patterns(plan: Plan) -> tuple[str, ...]:
+    """The patterns of the files that cause a reload, empty without hot reload."""
+    if not plan.options.hot_reload:
+        return ()
+    return plan.options.reload.watch or DEFAULT_WATCH
+
+
+def watch_warnings(plan: Plan) -> Iterator[str]:
+    """A warning for each given pattern that matches no file.
+
+    Only the owner of the files gets these: as root, doractl would search another user's
+    directories.
+    """
+    if not plan.options.hot_reload or not plan.options.reload.watch or _is_anothers(plan):
+        return
+    # Imported late: asyncio is slow to import, and only given patterns need a search.
+    from dora_systemd.adapters.host.watch import watch_rules, watched_files
+
+    rules = watch_rules(plan.options)
+    for pattern in unmatched_patterns(rules, watched_files(rules)):
+        yield f"no file below {rules.root} fits --watch {quoted(pattern)}"
+
+
+def _is_anothers(plan: Plan) -> bool:
+    return plan.user is not None and plan.user.pw_uid != os.geteuid()

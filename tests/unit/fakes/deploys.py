@@ -12,7 +12,7 @@ from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.enabled import trial_path
-from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy
 from dora_systemd.verbs.releases.listing import read_releases, store_of
 from dora_systemd.verbs.start.plan import StartRequest

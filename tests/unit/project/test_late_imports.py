@@ -13,7 +13,7 @@ LATE = {
     },
     "the gateway does without it until somebody looks at releases, or rolls back": {
         "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
-        "gateway.live.actions": {"verbs.releases.on_trial", "verbs.releases.rollback"},
+        "gateway.live.actions": {"verbs.releases.listing", "verbs.releases.rollback"},
     },
     "only some verbs wrap, and only on a terminal": {
         "terminal_text": {"textwrap"},
@@ -40,7 +40,7 @@ LATE = {
         "cli.remote.dispatch": {"cli.remote.rollout"},
     },
     "a restart of what runs makes no plan": {
-        "cli.verbs.run.restart": {"cli.last_words", "verbs.start.launch"},
+        "cli.verbs.run.restart": {"cli.last_words", "verbs.start.start"},
     },
     "only a wrong command line needs a similar command, or the names of dataflows": {
         "cli.group": {"difflib", "adapters.bus.systemd", "verbs.facts.cells"},
@@ -62,7 +62,7 @@ LATE = {
         "runner.nodes.lost_entries": {"adapters.journal.reader"},
         "verbs.stop": {
             *("adapters.host.unit_files", "adapters.journal.reader", "decisions.unit.file"),
-            *("verbs.start.claim", "verbs.start.enable"),
+            *("verbs.start.start", "verbs.start.enable"),
         },
     },
     "pydantic: only a settings file needs it": {
@@ -108,8 +108,8 @@ LATE = {
             "decisions.machines.spread",
         },
         "verbs.why": {"verbs.facts.machines", "verbs.releases.listing"},
-        "verbs.start.unit": {"decisions.machines.link_unit"},
-        "verbs.start.claim": {"decisions.machines.link_unit"},
+        "verbs.start.unit": {"adapters.host.watch", "decisions.machines.link_unit"},
+        "verbs.start.start": {"decisions.machines.link_unit"},
         "verbs.start.enable": {"decisions.machines.link_unit"},
         "link.talk": {"link.end_reason"},
         "link.relay": {"signal"},
@@ -121,7 +121,6 @@ LATE = {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},
         "verbs.reload": {"adapters.host.watch"},
-        "verbs.start.watch": {"adapters.host.watch"},
     },
     "a list without dataflows has no node": {
         "decisions.views.facts": {

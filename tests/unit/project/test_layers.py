@@ -265,7 +265,7 @@ STARTS_PROGRAMS = {
     "verbs.machines.member": "itself, as a smaller program",
     "adapters.host.guard": "itself, without another program",
     "verbs.node": "dora, as the caller",
-    "verbs.inhibit.hold": "what the caller has typed, as the caller",
+    "verbs.inhibit": "what the caller has typed, as the caller",
     "cli.verbs.look.logs": "the caller's own pager",
     "adapters.runner_socket.relay": "itself, as the user of the dataflow",
     "trust.courier": "git, as the user of the nodes",

@@ -51,8 +51,8 @@ _TABLE = {
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh cli.main
-        cli.edge cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold
-        verbs.machines.member verbs.machines.push verbs.start.credentials verbs.start.limits
+        cli.edge cli.verbs.look.logs decisions.cell.launch verbs.inhibit
+        verbs.machines.member verbs.machines.push verbs.start.find_files verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups
@@ -63,10 +63,10 @@ _TABLE = {
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
         adapters.host.guard
-        adapters.releases.draft adapters.releases.incoming
+        adapters.releases.draft adapters.releases.transfer
         adapters.releases.store verbs.releases.source verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
-        verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
+        verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.start.needs
         verbs.machines.register
         verbs.logs verbs.setup verbs.show verbs.start.enable verbs.up
     """,
@@ -87,7 +87,6 @@ _TABLE = {
     """,
     OTHERWISE: """
         adapters.dora.control adapters.host.addresses verbs.node
-        verbs.start.places
     """,
 }
 TABLE = {name: reason for reason, names in _TABLE.items() for name in names.split()}

@@ -10,8 +10,8 @@ import pytest
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.begin import make_lock
-from dora_systemd.verbs.act import act_on
 from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.restart import act_on
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 

@@ -18,7 +18,7 @@ from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_dora, make_program
-from tests.unit.verbs.start.test_claim import make_plan, place
+from tests.unit.verbs.start.test_start import make_plan, place
 
 
 @pytest.fixture

@@ -18,9 +18,13 @@ from dora_systemd.decisions.cell.environment import LOCK_VARIABLE, node_environm
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.verbs.facts.cells import Cell, read_cells
-from dora_systemd.verbs.facts.locks import read_holders
-from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited, uninhibited
-from dora_systemd.verbs.inhibit.hold import Lock, hold, inhibited_dataflows, take_inhibiting
+from dora_systemd.verbs.facts.locks import (
+    IfInhibited,
+    read_holders,
+    require_uninhibited,
+    uninhibited,
+)
+from dora_systemd.verbs.inhibit import Lock, hold, inhibited_dataflows, take_inhibiting
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
 
@@ -225,7 +229,7 @@ def test_what_is_no_file_is_not_followed(
     make_lock(other)
     with locked(other), pytest.raises(DoraSystemdError) as caught:
         require_uninhibited(scope, [cell], "restart")
-    monkeypatch.setattr("dora_systemd.verbs.inhibit.guard.read_cell_flocks", lambda _: {})
+    monkeypatch.setattr("dora_systemd.verbs.facts.locks.read_cell_flocks", lambda _: {})
     require_uninhibited(scope, [cell], "restart")  # no lock is held anywhere near
     assert "--force" in caught.value.hint
     assert str(lock) in caught.value.message

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.journal.note import send_note
+from dora_systemd.adapters.journal.note import caller, send_note
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.scope import Scope
@@ -18,7 +18,6 @@ from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import failure_reason
-from dora_systemd.verbs.start.asked import caller
 from dora_systemd.verbs.stop import (
     reset_cells,
     stop_cells,

@@ -17,7 +17,7 @@ from dora_systemd.decisions.dora.variables import (
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT, token_path
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs import gateway
-from dora_systemd.verbs.env import read_variables
+from dora_systemd.verbs.gateway import read_variables
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.tools import require
 

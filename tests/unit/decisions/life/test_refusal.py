@@ -8,9 +8,9 @@ from dora_systemd.decisions.life.refusal import format_refusal, parse_refusal, r
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.unit.properties import restart_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode, TimedOut
-from dora_systemd.verbs.start.job import start_unit
+from dora_systemd.verbs.start.start_unit import start_unit
 from tests.unit.fakes.manager import FakeManager, options
-from tests.unit.verbs.start.test_job import SCOPE, UNIT
+from tests.unit.verbs.start.test_start_unit import SCOPE, UNIT
 
 
 @pytest.mark.parametrize("code", [ExitCode.BAD_INPUT, ExitCode.NO_DORA, ExitCode.NO_PERMISSION])

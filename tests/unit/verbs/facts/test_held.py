@@ -12,8 +12,8 @@ from dora_systemd.decisions.why.report import format_report
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cell, read_cells
 from dora_systemd.verbs.facts.list import table_rows
-from dora_systemd.verbs.facts.whole import read_whole_rows
-from dora_systemd.verbs.needs.notes import held_notes
+from dora_systemd.verbs.list import read_whole_rows
+from dora_systemd.verbs.start.needs import held_notes
 from dora_systemd.verbs.top import Top
 from dora_systemd.verbs.why import explain
 from tests.unit.fakes.journal import FakeJournal, life_record

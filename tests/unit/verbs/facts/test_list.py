@@ -24,8 +24,8 @@ from dora_systemd.verbs import why
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import dataflow_row, read_rows, table_rows
 from dora_systemd.verbs.facts.reading import read_dataflow, read_status
-from dora_systemd.verbs.facts.snapshot import read_snapshot
 from dora_systemd.verbs.list import find_row
+from dora_systemd.verbs.top import read_snapshot
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options

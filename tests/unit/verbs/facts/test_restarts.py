@@ -9,9 +9,9 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import read_restarts
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import read_rows, table_rows
-from dora_systemd.verbs.facts.snapshot import read_snapshot
-from dora_systemd.verbs.facts.whole import read_whole_rows
+from dora_systemd.verbs.list import read_whole_rows
 from dora_systemd.verbs.stop import reset_cells
+from dora_systemd.verbs.top import read_snapshot
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import FakeManager, options
 

@@ -13,9 +13,8 @@ from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.budget import _starts
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import mark_enabled
-from dora_systemd.verbs.facts.snapshot import read_snapshot
-from dora_systemd.verbs.facts.whole import read_whole_rows
-from dora_systemd.verbs.top import Top
+from dora_systemd.verbs.list import read_whole_rows
+from dora_systemd.verbs.top import Top, read_snapshot
 from dora_systemd.verbs.why import subject_row
 from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import UUID, FakeManager, options

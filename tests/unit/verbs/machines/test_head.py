@@ -8,7 +8,7 @@ import pytest
 
 from dora_systemd.decisions.machines.wire import Beat, Part, Ready, format_message, parse_message
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.verbs.machines.head import Head, read_line
+from dora_systemd.verbs.machines.member import Head, read_line
 from tests.unit.fakes.manager import UUID
 
 PART = Part("robot", UUID, "gpu", "s3cret", 61001, 61003, "0" * 64, 5, "0.1.0", "1.1.0")

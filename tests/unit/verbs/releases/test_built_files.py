@@ -7,7 +7,7 @@ import pytest
 
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.project import Project, opened_project
-from dora_systemd.verbs.releases.built_files import find_built
+from dora_systemd.verbs.releases.build import find_built
 
 TREE = Path("/var/lib/dora-systemd/releases/robot/20260101T000000/tree")
 FILES = ("a.py", "built/x.log", "target/CACHEDIR.TAG", "target/release/node", "target/note")

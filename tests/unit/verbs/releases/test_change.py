@@ -18,7 +18,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.lives import now_boot
-from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.deploy import Deployed, deploy
 from dora_systemd.verbs.releases.rollback import roll_back

@@ -15,7 +15,7 @@ from dora_systemd.adapters.releases.store import locked
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.releases.copy import copy_project
 from dora_systemd.verbs.releases.deploy import compare
-from dora_systemd.verbs.releases.on_trial import refuse_on_trial
+from dora_systemd.verbs.releases.listing import refuse_on_trial
 from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.releases.trial import read_standing
 from tests.unit.fakes.deploys import FLOW, UNIT, Bench
@@ -183,9 +183,7 @@ def test_a_full_disk(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("has_user", "mode"), [(True, 0o750), (False, 0o700)])
-def test_the_group_of_its_user_may_enter_a_release(
-    has_user: bool, mode: int, bench: Bench
-) -> None:
+def test_the_group_of_its_user_may_enter_a_release(has_user: bool, mode: int, bench: Bench) -> None:
     user = pwd.getpwuid(os.geteuid()) if has_user else None
     source = find_source(bench.scope, bench.start(), False)
     source = replace(source, plan=replace(source.plan, user=user))

@@ -7,7 +7,7 @@ import pytest
 
 from dora_systemd.adapters.releases.store import Store
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.releases import change as module
 from dora_systemd.verbs.releases.change import Change
 from dora_systemd.verbs.releases.trial import Standing, begin_trial, read_life, read_standing

@@ -22,9 +22,15 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.deploy import prune
 from dora_systemd.verbs.releases.listing import read_history, read_releases, store_of
-from dora_systemd.verbs.releases.past import KILLED, note_fault, note_run, read_past
 from dora_systemd.verbs.releases.rollback import roll_back
-from dora_systemd.verbs.releases.trial import Standing, read_standing
+from dora_systemd.verbs.releases.trial import (
+    KILLED,
+    Standing,
+    note_fault,
+    note_run,
+    read_past,
+    read_standing,
+)
 from dora_systemd.verbs.why import explain
 from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager

@@ -11,9 +11,8 @@ from typing import Any, cast
 import pytest
 
 from dora_systemd.adapters.releases.draft import Draft
-from dora_systemd.adapters.releases.incoming import Stream, incoming, leftovers
-from dora_systemd.adapters.releases.spool import spooled
 from dora_systemd.adapters.releases.store import Store
+from dora_systemd.adapters.releases.transfer import Stream, incoming, leftovers, spooled
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.parcel import Parcel, format_parcel

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.releases.incoming import Stream
-from dora_systemd.adapters.releases.spool import spooled
+from dora_systemd.adapters.releases.transfer import Stream, spooled
 from dora_systemd.decisions.releases.parcel import Parcel, format_parcel
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import SECOND

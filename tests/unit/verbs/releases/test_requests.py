@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.releases.draft import Draft
-from dora_systemd.adapters.releases.incoming import incoming
 from dora_systemd.adapters.releases.store import Store, locked
+from dora_systemd.adapters.releases.transfer import incoming
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import REPLACED, Switch

@@ -17,7 +17,7 @@ from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.trial import read_after_wait, read_standing, require_deployable

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.decisions.unit.file import with_boot_check
-from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.releases.trial import commit, read_standing
 from tests.unit.fakes.deploys import FLOW, UNIT, Bench
 from tests.unit.verbs.releases.test_received import FILES, Sender

@@ -10,7 +10,7 @@ from dora_systemd.adapters.bus.manager import Beside, Observer, Property
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.start.check import check_plan
 from tests.unit.fakes.manager import FakeManager
-from tests.unit.verbs.start.test_job import make_plan
+from tests.unit.verbs.start.test_start_unit import make_plan
 
 
 class CheckingManager(FakeManager):

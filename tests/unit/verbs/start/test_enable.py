@@ -11,12 +11,11 @@ from dora_systemd.decisions.unit.file import says_the_same
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.export import export_cell
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.list import find_row
-from dora_systemd.verbs.show import unit_files
+from dora_systemd.verbs.show import export_cell, unit_files
 from dora_systemd.verbs.start.enable import (
     boot_target,
     disable_cell,
@@ -24,7 +23,7 @@ from dora_systemd.verbs.start.enable import (
     install_unit_file,
     read_boot_unit,
 )
-from dora_systemd.verbs.start.linger import ensure_linger, linger_note
+from dora_systemd.verbs.start.logins import ensure_linger, linger_note
 from dora_systemd.verbs.stop import stop_cells
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_program

@@ -12,13 +12,13 @@ from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.start.claim import (
+from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.start import (
     place_unit_file,
     refuse_unit_file,
     require_free_name,
     with_known_uuid,
 )
-from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.unit import plan_properties
 from tests.unit.fakes.manager import UUID, FakeManager, options
 

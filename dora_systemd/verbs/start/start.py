@@ -1,9 +1,13 @@
-"""Checks that the name of a new dataflow is free, and cleans up after an ended one."""
+"""The steps from a request to a started unit that all ways of starting share.
 
-from dataclasses import replace
+The name of a new dataflow has to be free; what an ended one has left is removed.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Beside, Manager
+from dora_systemd.adapters.bus.manager import Beside, Manager, Property, StageObserver
 from dora_systemd.adapters.host.unit_files import (
     read_unit_file,
     remove_changes,
@@ -15,11 +19,13 @@ from dora_systemd.decisions.unit.file import persistent_unit, says_the_same, use
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.decisions.unit.versions import drop_unsupported
 from dora_systemd.decisions.views.formats import local_time
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import release_of
+from dora_systemd.names import release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import shown
 from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import (
     BootUnit,
     boot_target,
@@ -30,8 +36,67 @@ from dora_systemd.verbs.start.enable import (
     release_transient,
     wait_until_forgotten,
 )
-from dora_systemd.verbs.start.plan import Plan
-from dora_systemd.verbs.start.unit import plan_links, systemd_number
+from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
+from dora_systemd.verbs.start.restart_ended import Asked, note_start
+from dora_systemd.verbs.start.start_unit import start_unit
+from dora_systemd.verbs.start.unit import plan_links, plan_properties, systemd_number
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A dataflow whose name is free. properties, links: for start_unit()."""
+
+    plan: Plan
+    properties: Sequence[Property] | None
+    warnings: tuple[str, ...]
+    links: Beside = ()
+
+
+def claim(
+    manager: Manager,
+    scope: Scope,
+    request: StartRequest,
+    command: str,
+    want_boot: bool = False,
+) -> Claim:
+    """Check the request, prepare its unit and note the request, see restart_ended.py.
+
+    command: by which it is asked. want_boot: as a unit file that is started at boot.
+
+    Raises DoraSystemdError; then nothing has changed.
+    """
+    boot = require_free_name(manager, scope, unit_name(request_name(request)))
+    plan = with_known_uuid(make_plan(scope, request), boot)
+    properties, warnings = plan_properties(plan, manager)
+    if want_boot:
+        # Check first: the unit file is written before a runner could refuse the dataflow.
+        check_plan(lambda: manager, plan)
+    has_file = place_unit_file(manager, plan, properties, boot, want_boot)
+    note_start(plan, request, command)
+    has_links = bool(plan.members) and not has_file
+    links = prepared_links(manager, plan, systemd_number(manager)) if has_links else ()
+    return Claim(plan, None if has_file else list(properties.values()), tuple(warnings), links)
+
+
+def restart_asked(
+    manager: Manager,
+    scope: Scope,
+    asked: Asked,
+    environment: Mapping[str, str],
+    on_stage: StageObserver | None,
+) -> Outcome:
+    """Start what has ended once more, with the UUID and the settings it had, and wait for it.
+
+    environment: the caller's variables.
+    """
+    try:
+        request = asked.request(StartRequest(asked.dataflow, environment=environment))
+        claimed = claim(manager, scope, request, "doractl restart")
+        options = claimed.plan.options
+        start_unit(manager, scope, options, claimed.properties, on_stage, True, claimed.links)
+    except DoraSystemdError as error:
+        return Outcome.of_error(asked, error)
+    return Outcome(asked, f"Dataflow restarted: {asked.uuid} ({asked.name})")
 
 
 def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.events import FORGOTTEN
 from dora_systemd.decisions.logs.query import request_matches
@@ -23,7 +24,6 @@ from dora_systemd.trust.paths import exists, is_directory
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
-from dora_systemd.verbs.start.asked import note_request
 
 if TYPE_CHECKING:
     from dora_systemd.verbs.start.plan import Plan, StartRequest

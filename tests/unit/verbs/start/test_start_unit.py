@@ -7,8 +7,8 @@ import pytest
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.start.job import Started, format_started, start_unit
 from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.start_unit import Started, format_started, start_unit
 from dora_systemd.verbs.start.unit import format_plan, plan_properties
 from tests.unit.fakes.manager import UUID, FakeManager, options
 

@@ -5,8 +5,8 @@ import pytest
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import need_failure
-from dora_systemd.verbs.needs.dependents import find_dependents, format_dependents
-from dora_systemd.verbs.needs.notes import needs_warnings
+from dora_systemd.verbs.start.needs import needs_warnings
+from dora_systemd.verbs.stop import find_dependents, format_dependents
 from tests.unit.fakes.manager import FakeManager, options
 
 NEEDS = (NodeNeed("arm", "/dev/odd"), NodeNeed("arm", "/dev/video0"))

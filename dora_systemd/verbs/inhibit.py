@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.decisions.cell.inhibit import format_reason
 from dora_systemd.decisions.views.inhibitors import Inhibited, format_holders
 from dora_systemd.decisions.views.rows import Holder
@@ -17,7 +18,6 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.locks import find_lock, open_lock, place_of, take_lock, write_reason
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.locks import holders_of, read_cell_flocks, read_holders
-from dora_systemd.verbs.start.asked import note_request
 
 RENEW_SECONDS = 1.0
 """How often it looks whether the dataflow has restarted, and has a new lock file."""

@@ -12,14 +12,14 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.start.again import (
+from dora_systemd.verbs.start.plan import Plan, StartRequest
+from dora_systemd.verbs.start.restart_ended import (
     Asked,
     find_known,
     find_start,
     means_name,
     note_start,
 )
-from dora_systemd.verbs.start.plan import Plan, StartRequest
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
