@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import click
 
 from dora_systemd import __version__
-from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.cli.parameters import current_scope, scope_options, without_all
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 TITLES = {
@@ -115,7 +115,8 @@ class VerbGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        name = args[0]
+        name, *words = args
+        args = [name, *without_all(ctx, words)]
         if name.startswith("-") or self.get_command(ctx, name):
             return super().resolve_command(ctx, args)
         raise DoraSystemdError(f"unknown command {name!r}", _meant_verb(name), ExitCode.USAGE)

@@ -18,6 +18,9 @@ T = TypeVar("T")
 _SCOPE_KEY = "dora_systemd.is_user"
 _OUTPUT_KEY = "dora_systemd.output"
 _HOST_KEY = "dora_systemd.host"
+_HELP_KEY = "dora_systemd.help_all"
+
+HELP_ALL = "--help=all"
 
 
 def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) -> None:
@@ -59,6 +62,20 @@ _host_option = click.option(
 def scope_options(command: C) -> C:
     """`--system`, `--user` and -H, before or after the verb; the last scope counts."""
     return _scope_option(_host_option(command))
+
+
+def without_all(ctx: click.Context, words: list[str]) -> list[str]:
+    """Replace --help=all by --help, for wants_all(). What follows `--` stays."""
+    end = words.index("--") if "--" in words else len(words)
+    if HELP_ALL not in words[:end]:
+        return words
+    ctx.meta[_HELP_KEY] = True
+    return ["--help" if word == HELP_ALL else word for word in words[:end]] + words[end:]
+
+
+def wants_all(ctx: click.Context) -> bool:
+    """Whether --help shows every option of a verb that has many."""
+    return bool(ctx.meta.get(_HELP_KEY))
 
 
 def is_elsewhere() -> bool:

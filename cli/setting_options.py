@@ -1,10 +1,13 @@
-"""The options of `start` and `run`: one for each setting with a flag, from the settings table."""
+"""The options of `start` and `run`: one for each setting with a flag, and their short --help."""
 
 from collections.abc import Callable, Sequence
+from copy import copy
+from inspect import cleandoc
 from typing import Any, TypeVar
 
 import click
 
+from dora_systemd.cli.parameters import HELP_ALL, wants_all
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.table import CHANGEABLE, SECTIONS, SETTINGS
 
@@ -13,8 +16,19 @@ F = TypeVar("F", bound=Callable[..., Any])
 _SECTION_OF = {setting.name: title for title, table in SECTIONS.items() for setting in table}
 
 
+_EXAMPLES = 5
+
+
 class SettingsCommand(click.Command):
-    """A verb whose --help shows its own options first, then those of settings by concern."""
+    """A verb with many options: --help shows the usual ones in one screen, --help=all the others.
+
+    usual: the usual options; empty if --help always shows all. All are shown by concern: first
+    those of the verb, then those of settings.
+    """
+
+    def __init__(self, *args: Any, usual: Sequence[str] = (), **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._usual = usual
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the command line; `--flag=false` is `--no-flag`, as dora writes it."""
@@ -24,8 +38,45 @@ class SettingsCommand(click.Command):
                 known |= {f"{on}=true": on, f"{on}=false": off}
         return super().parse_args(ctx, [known.get(word, word) for word in args])
 
+    def format_help(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write all of it, or of text and examples the beginning."""
+        super(SettingsCommand, self._shortened() if self._is_short(ctx) else self).format_help(
+            ctx, formatter
+        )
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the sections of options."""
+        """Write the usual options, or all by concern."""
+        if self._is_short(ctx):
+            self._format_usual(ctx, formatter)
+        else:
+            self._format_all(ctx, formatter)
+
+    def _is_short(self, ctx: click.Context) -> bool:
+        return bool(self._usual) and not wants_all(ctx)
+
+    def _shortened(self) -> "SettingsCommand":
+        """A copy with the first paragraph and the first examples, below their heading."""
+        short = copy(self)
+        short.help = cleandoc(self.help or "").partition("\n\n")[0]
+        short.epilog = "\n".join((self.epilog or "").splitlines()[: 2 + _EXAMPLES])
+        return short
+
+    def _format_usual(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        records = [
+            (parameter.opts[0], record)
+            for parameter in self.get_params(ctx)
+            if isinstance(parameter, click.Option) and (record := parameter.get_help_record(ctx))
+        ]
+        of = dict(records)
+        # Of a help text what stands before the first semicolon; --help=all has the rest.
+        rows = [
+            (of[flag][0].split(" / ")[0], f"{of[flag][1].split('; ')[0].rstrip('.')}.")
+            for flag in self._usual
+        ]
+        with formatter.section("Usual options"):
+            formatter.write_dl([*rows, (HELP_ALL, f"Show all {len(records)} options.")])
+
+    def _format_all(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         sections: dict[str, list[tuple[str, str]]] = {title: [] for title in ("Options", *SECTIONS)}
         for parameter in self.get_params(ctx):
             if isinstance(parameter, click.Option) and (record := parameter.get_help_record(ctx)):

@@ -40,7 +40,13 @@ _INPUT = 0
 _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
 
 
-@click.command("deploy", cls=SettingsCommand)
+_USUAL = (
+    *("--name", "--soak", "--dry-run", "--no-build", "--no-enable", "--force", "--venv"),
+    *("--memory-limit", "--restart-policy", "--writable", "-H"),
+)
+
+
+@click.command("deploy", cls=SettingsCommand, usual=_USUAL)
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE|DIR]")
 @name_option
 @setting_options

@@ -26,8 +26,13 @@ from dora_systemd.verbs.start.run import attached_properties, life_line
 from dora_systemd.verbs.start.start import make_room, refuse_unit_file, require_free_name
 from dora_systemd.verbs.start.unit import plan_properties
 
+_USUAL = (
+    *("--name", "--stop-after", "--env", "--venv", "--uv"),
+    *("--memory-limit", "--cpu-limit", "--device", "--writable", "--hot-reload"),
+)
 
-@click.command("run", cls=SettingsCommand)
+
+@click.command("run", cls=SettingsCommand, usual=_USUAL)
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
 @duration_option("--stop-after", "Stop it gracefully when it has run so long, such as 30s or 5min.")

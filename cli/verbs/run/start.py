@@ -38,8 +38,13 @@ from dora_systemd.verbs.start.start import Claim, claim, require_free_name
 from dora_systemd.verbs.start.start_unit import Started, format_started, start_unit
 from dora_systemd.verbs.start.unit import format_plan, watched_patterns
 
+_USUAL = (
+    *("--name", "--enable", "--attach", "--dry-run", "--env", "--venv", "--memory-limit"),
+    *("--cpu-limit", "--restart-policy", "--device", "--writable", "--hot-reload"),
+)
 
-@click.command("start", cls=SettingsCommand)
+
+@click.command("start", cls=SettingsCommand, usual=_USUAL)
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE|NAME]")
 @name_option
 @setting_options
@@ -76,17 +81,17 @@ def command(
     Examples:
       doractl start                           ./dataflow.yml
       doractl start dataflow.yml --name robot
+      doractl start dataflow.yml --enable     now and at every boot
+      doractl start dataflow.yml --memory-limit 4G --restart-policy on-failure
+      doractl start robot                     what list --all shows, once more
       doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
-      doractl start dataflow.yml --memory-limit 4G --node-limit camera:cpu=1.5
-      doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
+      doractl start dataflow.yml --node-limit camera:cpu=1.5 --max-restarts 3
       doractl start dataflow.yml --credential token=/etc/robot/token
       doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
       doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
-      doractl start dataflow.yml --enable     now and at every boot
       doractl start dataflow.yml --attach     with its logs, as doractl run
       doractl start dataflow.yml --dry-run
       doractl start dataflow.yml --push       to all of its machines first
-      doractl start robot                     what list --all shows, once more
     """
     if want_logs and (no_wait or wants_json()):
         hint = "leave out --no-wait and --output"

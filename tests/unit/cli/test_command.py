@@ -77,6 +77,35 @@ def test_every_verb_has_help_with_examples(
     assert f"doractl {ALIASES.get(name, name)}" in shown
 
 
+@pytest.mark.parametrize("verb", ["start", "run", "deploy"])
+def test_the_usual_options_are_one_screen(
+    verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main.run([verb, "--help"]) == 0
+    short = capsys.readouterr().out.splitlines()
+    assert len(short) <= 30
+    for words in ([verb, "--help=all"], ["help", verb, "--help=all"], [verb, "x", "--help=all"]):
+        assert main.run(words) == 0
+        full = capsys.readouterr().out
+        command = VERBS[verb].command
+        shown = [one for one in options_of(command) if not one.hidden]
+        assert not [one.opts[0] for one in shown if one.opts[0] not in full]
+        assert all(line in full for line in (command.epilog or "").splitlines()[1:])
+    (count,) = [line.split()[-2] for line in short if "--help=all" in line]
+    assert int(count) == len(shown) + 1  # and -h
+
+
+def test_help_of_all_options_everywhere(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in (["list"], ["node", "restart"]):
+        assert main.run([*verb, "--help"]) == 0
+        shown = capsys.readouterr().out
+        assert main.run([*verb, "--help=all"]) == 0
+        assert capsys.readouterr().out == shown
+    # Behind -- it is a word of somebody else's.
+    assert main.run(["inhibit", "robot", "--help", "--", "true", "--help=all"]) == 0
+
+
 def options_of(command: click.Command) -> Iterator[click.Option]:
     if isinstance(command, click.Group):
         for one in command.commands.values():
@@ -337,7 +366,7 @@ def test_version_loads_next_to_nothing() -> None:
 def test_settings_stand_by_concern_with_their_defaults(
     capsys: pytest.CaptureFixture[str], verb: str
 ) -> None:
-    assert main.run([verb, "--help"]) == 0
+    assert main.run([verb, "--help=all"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     titles = ["Options:", "Nodes:", "Limits:", "Rights of nodes:", "Restarts:"]
     titles += ["Sandbox and secrets:", "Hot reload:"]
