@@ -14,8 +14,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.cli.parameters import print_warnings
 from dora_systemd.cli.terminal import StageLine, wants_colors
-from dora_systemd.decisions.logs.filter import LogFilter
-from dora_systemd.decisions.logs.records import DoraLines, Record
+from dora_systemd.decisions.logs.records import DoraLines, LogFilter, Record
 from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.scope import scope_of
 from dora_systemd.values import INFINITY

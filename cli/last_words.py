@@ -5,7 +5,7 @@ from dataclasses import replace
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import tell
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.decisions.why.signs import known_remedy
+from dora_systemd.decisions.why.remedies import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.why import words_of_start

@@ -58,7 +58,7 @@ class StageLine(AbstractContextManager["StageLine"]):
         if not text.startswith("waiting for machine") or text == self._shown:
             return
         # Imported late: most dataflows run on one machine.
-        from dora_systemd.decisions.machines.awaited import is_news
+        from dora_systemd.decisions.cell.machines import is_news
 
         if is_news(text):
             self._shown = text

@@ -11,8 +11,8 @@ import click
 from dora_systemd.cli.group import VerbGroup, doractl, run_verb
 from dora_systemd.cli.remote.plan import ROLLOUTS, Plan, check_hosts, plan_of, valued_flags
 from dora_systemd.cli.remote.run import is_terminal, pass_through, run_on_all, run_there
+from dora_systemd.decisions.remote.command_line import part_hosts
 from dora_systemd.decisions.remote.hosts import ALL, Host, given_words
-from dora_systemd.decisions.remote.words import part_hosts
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.remote.hosts import find_hosts
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import click
 
-from dora_systemd.decisions.remote.command import Way
-from dora_systemd.decisions.remote.words import without_flag
+from dora_systemd.decisions.remote.command_line import without_flag
+from dora_systemd.decisions.remote.hosts import Way
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.remote.talk import ANSWER_SECONDS, SHORT_SECONDS
 

@@ -14,12 +14,11 @@ from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.terminal import wants_colors
 from dora_systemd.decisions.logs.query import journal_timestamp
 from dora_systemd.decisions.logs.terminal import TerminalLines
-from dora_systemd.decisions.remote.failures import invalid, too_much
+from dora_systemd.decisions.remote.command_line import with_output
 from dora_systemd.decisions.remote.hosts import Host
-from dora_systemd.decisions.remote.merge import Merge
-from dora_systemd.decisions.remote.records import TIME, Records, time_of
+from dora_systemd.decisions.remote.merge import TIME, Merge, Records, time_of
+from dora_systemd.decisions.remote.ssh_failures import invalid, too_much
 from dora_systemd.decisions.remote.stream import Lines, objects_of, read_object, with_host
-from dora_systemd.decisions.remote.words import with_output
 from dora_systemd.decisions.views.objects import error_object, format_json
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import one_line, shown_log

@@ -14,9 +14,8 @@ from dora_systemd.cli.remote.run import Interrupts, run_on_all
 from dora_systemd.cli.terminal import StageLine
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.parcel import format_parcel, parse_wants, total
-from dora_systemd.decisions.remote.command import Way
-from dora_systemd.decisions.remote.failures import invalid, too_much
-from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.command_line import with_options, with_output
+from dora_systemd.decisions.remote.hosts import Host, Way
 from dora_systemd.decisions.remote.rollout import (
     NOT_TRIED,
     Columns,
@@ -27,8 +26,8 @@ from dora_systemd.decisions.remote.rollout import (
     verdict_of,
     worst_status,
 )
+from dora_systemd.decisions.remote.ssh_failures import invalid, too_much
 from dora_systemd.decisions.remote.stream import read_json, read_object, with_host
-from dora_systemd.decisions.remote.words import with_options, with_output
 from dora_systemd.decisions.views.objects import error_object, format_json
 from dora_systemd.errors import ExitCode
 from dora_systemd.values import format_rounded_size

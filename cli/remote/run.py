@@ -23,22 +23,27 @@ from dora_systemd.cli.remote.printers import (
     TablePrinter,
     words_of_logs,
 )
-from dora_systemd.decisions.remote.command import (
+from dora_systemd.decisions.remote.command_line import with_output
+from dora_systemd.decisions.remote.host_tables import (
+    cells_of,
+    format_hosts,
+    format_releases,
+    row_of,
+)
+from dora_systemd.decisions.remote.hosts import (
     NO_PROGRAM,
+    Host,
     Way,
     remote_command,
     ssh_arguments,
 )
-from dora_systemd.decisions.remote.failures import (
+from dora_systemd.decisions.remote.ssh_failures import (
     SSH_FAILED,
     is_of_ssh,
     lost,
     unreached,
     without_doractl,
 )
-from dora_systemd.decisions.remote.hosts import Host
-from dora_systemd.decisions.remote.table import cells_of, format_hosts, format_releases, row_of
-from dora_systemd.decisions.remote.words import with_output
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import shown_log
 from dora_systemd.verbs.facts.selector import is_pattern

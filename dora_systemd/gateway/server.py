@@ -1,7 +1,7 @@
 """The gateway's server: HTTP and WebSockets on the sockets that systemd has opened.
 
-access.py decides about every connection before a route gets it. There is one request for each
-connection.
+decisions/gateway/request.py decides about every connection before a route gets it. There is one
+request for each connection.
 """
 
 import asyncio
@@ -18,14 +18,16 @@ from typing import Any
 from websockets.exceptions import WebSocketException
 from websockets.http11 import Request as RawRequest
 
-from dora_systemd.decisions.gateway.access import (
+from dora_systemd.decisions.gateway.request import (
     STRANGER_SECONDS,
+    Answer,
     Door,
+    Request,
     has_token,
     refuse_address,
     refuse_user,
+    text_answer,
 )
-from dora_systemd.decisions.gateway.request import Answer, Request, text_answer
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.connection import Gone, ServerSocket
 from dora_systemd.gateway.live.actions import ACTIONS

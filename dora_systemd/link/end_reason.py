@@ -1,13 +1,13 @@
 """What the head is told when a connection has ended, from ssh's own words."""
 
 from dora_systemd.decisions.machines.wire import FromLink, Lost, Taken, Unreached
-from dora_systemd.decisions.remote.failures import (
+from dora_systemd.decisions.remote.hosts import Host, parse_host
+from dora_systemd.decisions.remote.ssh_failures import (
     SSH_FAILED,
     ending_error,
     failed_there,
     last_line,
 )
-from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 _FINAL = ("HAS CHANGED", "Host key verification failed", "Permission denied")

@@ -26,7 +26,7 @@ from dora_systemd.adapters.runner_socket.listener import serve
 from dora_systemd.decisions.cell.environment import with_changes
 from dora_systemd.decisions.cell.launch import kinds
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
-from dora_systemd.decisions.descriptor.wiring import downstream_of
+from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit

@@ -1,6 +1,6 @@
 """Answers what people ask at the socket of the runner of single nodes, and before a restart.
 
-A request for a node is recorded before it is carried out, see decisions/cell/asked.py. A restart
+A request for a node is recorded before it is carried out, see decisions/cell/status.py. A restart
 replaces the process as a reload does, see runner/reload/swap.py. Nothing brings back a node after
 StopNode of dora. So the Hand does otherwise:
 
@@ -18,16 +18,23 @@ from typing import Any
 
 from dora_systemd.adapters.runner_socket.client import Request, refused_reply
 from dora_systemd.adapters.runner_socket.listener import Answer
-from dora_systemd.decisions.cell.asked import RESTART, STOP, format_asked, is_stopped
 from dora_systemd.decisions.cell.exits import Exit
-from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
+from dora_systemd.decisions.cell.status import (
+    HELD,
+    LATCHED,
+    RESTART,
+    STOP,
+    NodeStatus,
+    format_asked,
+    is_stopped,
+)
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.nodes import held, is_over_but_for_held
+from dora_systemd.decisions.life.node_table import held, is_over_but_for_held
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.view import initial_nodes
-from dora_systemd.decisions.needs.words import format_wait
+from dora_systemd.decisions.needs.waiting import format_wait
 from dora_systemd.errors import DoraSystemdError, ExitCode, TimedOut
 from dora_systemd.runner.cell.machine_role import Alone
 from dora_systemd.runner.cell.pump import now_us

@@ -31,9 +31,15 @@ from dora_systemd.decisions.views.diagnosis import (
     judge_rate,
     judge_systemd,
 )
-from dora_systemd.decisions.views.findings import Finding, State
-from dora_systemd.decisions.views.journal import Place, judge_journal, storage_of
-from dora_systemd.decisions.views.real_time import judge_cpuset, judge_real_time
+from dora_systemd.decisions.views.findings import (
+    Finding,
+    Place,
+    State,
+    judge_cpuset,
+    judge_journal,
+    judge_real_time,
+    storage_of,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of

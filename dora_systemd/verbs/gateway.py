@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.addresses import answers_health
-from dora_systemd.decisions.dora.variables import coordinator_variables
+from dora_systemd.decisions.dora.command import coordinator_variables
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT, port_of, token_path
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope

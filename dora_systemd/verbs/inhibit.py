@@ -10,8 +10,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
-from dora_systemd.decisions.cell.inhibit import format_reason
-from dora_systemd.decisions.views.inhibitors import Inhibited, format_holders
+from dora_systemd.decisions.views.inhibitors import Inhibited, format_holders, format_reason
 from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope

@@ -10,10 +10,9 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import caller
 from dora_systemd.adapters.runner_socket import client as runner_socket
 from dora_systemd.adapters.runner_socket.client import done_of, order
+from dora_systemd.decisions.dora.command import coordinator_variables, parse_node_command
 from dora_systemd.decisions.dora.coordinator import Coordinator
-from dora_systemd.decisions.dora.node_command import parse_node_command
 from dora_systemd.decisions.dora.protocol import Params, Reply
-from dora_systemd.decisions.dora.variables import coordinator_variables
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean
 from dora_systemd.paths import CellPaths
@@ -85,7 +84,7 @@ def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
 
 @dataclass(frozen=True)
 class NodeOrder:
-    """What is asked of one node. what: RESTART or STOP of decisions/cell/asked.py.
+    """What is asked of one node. what: RESTART or STOP of decisions/cell/status.py.
 
     by: the door, such as "doractl node stop". grace: µs that its process has to end; None: that of
     the dataflow.

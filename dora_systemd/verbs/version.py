@@ -13,7 +13,7 @@ from pathlib import Path
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.dora.command import dora_version, find_dora
-from dora_systemd.decisions.machines.facts import Facts
+from dora_systemd.decisions.machines.description import Facts
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name

@@ -5,9 +5,8 @@ from contextlib import suppress
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.cell.asked import is_stopped
-from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
-from dora_systemd.decisions.life import nodes as node_table
+from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus, is_stopped
+from dora_systemd.decisions.life import node_table
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.past import FAILED as TRIAL_FAILED
 from dora_systemd.decisions.releases.past import Switch, completed, undone

@@ -19,8 +19,7 @@ from dora_systemd.decisions.cell.exits import parse_exit
 from dora_systemd.decisions.cell.limits import parse_changes
 from dora_systemd.decisions.cell.line_rates import parse_rates
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.descriptor.build_session import parse_session
-from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow, parse_session
 from dora_systemd.decisions.dora.coordinator import parse_coordinator
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.decisions.dora.life_events import parse_daemon_line, parse_life_event
@@ -34,11 +33,10 @@ from dora_systemd.decisions.dora.protocol import (
     parse_running,
     parse_spawn_failure,
 )
-from dora_systemd.decisions.gateway.access import has_token, refuse_address
 from dora_systemd.decisions.gateway.frames import Malformed, format_malformed, parse_request
 from dora_systemd.decisions.gateway.page_messages import parse_message
+from dora_systemd.decisions.gateway.request import has_token, refuse_address
 from dora_systemd.decisions.life.refusal import parse_refusal
-from dora_systemd.decisions.logs.filter import parse_filter
 from dora_systemd.decisions.logs.lines import (
     LineEncoder,
     LineSplitter,
@@ -47,8 +45,9 @@ from dora_systemd.decisions.logs.lines import (
     json_fields,
     jsonl_fields,
 )
+from dora_systemd.decisions.logs.records import parse_filter
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.machines.facts import Facts, parse_facts, problems, summary
+from dora_systemd.decisions.machines.description import Facts, parse_facts, problems, summary
 from dora_systemd.decisions.properties.assignments import parse_property
 from dora_systemd.decisions.releases.parcel import (
     format_parcel,

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.releases.store import store_root
-from dora_systemd.decisions.cell.asked import is_stopping
-from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.cell.status import NodeStatus, is_stopping
 from tests.history import member
 from tests.history.history import Answer, History, Look
 from tests.history.recorder import (

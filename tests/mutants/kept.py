@@ -34,7 +34,7 @@ KEPT = (
     ),
     Kept("decisions/life/table", r"keys\(\) < ", "no state handles all events itself"),
     Kept(
-        "decisions/why/nodes",
+        "decisions/why/lives",
         r'NodeRow\(node, (None|"XXXX"), restarts=0\)\)\._replace',
         "the state is set there",
     ),

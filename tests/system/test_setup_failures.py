@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.decisions.life.setup_exits import setup_failure
+from dora_systemd.decisions.life.refusal import setup_failure
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 from tests.system.test_list_questions import check_truth, is_running
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from dora_systemd.decisions.signs.table import parse_sign
+from dora_systemd.decisions.watchdog.messages import parse_sign
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, wait_for

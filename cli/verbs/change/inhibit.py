@@ -14,10 +14,10 @@ from dora_systemd.cli.parameters import (
     tell,
     wants_json,
 )
-from dora_systemd.decisions.cell.inhibit import parse_reason
 from dora_systemd.decisions.views.inhibitors import (
     format_inhibited,
     inhibited_objects,
+    parse_reason,
 )
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -10,7 +10,7 @@ from dora_systemd.cli.parameters import (
     print_outcomes,
     scope_options,
 )
-from dora_systemd.decisions.cell.asked import RESTART, STOP
+from dora_systemd.decisions.cell.status import RESTART, STOP
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.facts.selector import Selector

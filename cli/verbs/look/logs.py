@@ -14,7 +14,6 @@ import click
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
 from dora_systemd.cli.terminal import is_dumb, wants_colors
-from dora_systemd.decisions.logs.filter import parse_filter
 from dora_systemd.decisions.logs.query import (
     ALL_LINES,
     OUTPUTS,
@@ -22,6 +21,7 @@ from dora_systemd.decisions.logs.query import (
     is_boot,
     parse_level,
 )
+from dora_systemd.decisions.logs.records import parse_filter
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import LINK_PREFIX

@@ -6,8 +6,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
-from dora_systemd.decisions.why.report import format_report
-from dora_systemd.decisions.why.report_object import report_object
+from dora_systemd.decisions.why.report import format_report, report_object
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.why import explain, newest_failure, subject_row
 

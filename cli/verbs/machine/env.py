@@ -5,7 +5,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.decisions.dora.variables import SHELLS, format_exports, format_unsets
+from dora_systemd.decisions.dora.command import SHELLS, format_exports, format_unsets
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.gateway import read_variables
 

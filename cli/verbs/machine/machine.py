@@ -16,7 +16,7 @@ from dora_systemd.cli.parameters import (
     tell,
     wants_json,
 )
-from dora_systemd.decisions.machines.facts import summary
+from dora_systemd.decisions.machines.description import summary
 from dora_systemd.decisions.remote.hosts import parse_host
 from dora_systemd.decisions.views.dataflows import format_table
 from dora_systemd.errors import DoraSystemdError, ExitCode

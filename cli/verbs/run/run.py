@@ -16,8 +16,7 @@ from dora_systemd.cli.parameters import (
     scope_options,
 )
 from dora_systemd.cli.setting_options import SettingsCommand, setting_options
-from dora_systemd.decisions.logs.filter import RAW, LogFilter, parse_filter
-from dora_systemd.decisions.logs.records import DORA_LEVELS
+from dora_systemd.decisions.logs.records import DORA_LEVELS, RAW, LogFilter, parse_filter
 from dora_systemd.names import unit_name
 from dora_systemd.verbs.start.enable import drop_unit_files
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name

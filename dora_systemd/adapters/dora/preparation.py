@@ -20,16 +20,17 @@ from dora_systemd.decisions.cell.line_rates import check_rates
 from dora_systemd.decisions.cell.needs import check_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
-from dora_systemd.decisions.descriptor.build_session import (
+from dora_systemd.decisions.cell.rights import check_rights_nodes
+from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
+    Dataflow,
+    parse_dataflow,
     parse_session,
     session_path,
 )
-from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.owes.check import check_owes
-from dora_systemd.decisions.rights.node_rights import check_rights_nodes
-from dora_systemd.decisions.signs.watchdogs import check_watchdogs
+from dora_systemd.decisions.watchdog.watchdogs import check_watchdogs
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight

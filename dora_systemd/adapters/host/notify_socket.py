@@ -12,7 +12,7 @@ import socket
 import struct
 from pathlib import Path
 
-from dora_systemd.decisions.signs.messages import MAX_BYTES
+from dora_systemd.decisions.watchdog.messages import MAX_BYTES
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 MAX_PATH = 107

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.host.process import run_command
-from dora_systemd.decisions.views.real_time import RealTime
+from dora_systemd.decisions.views.findings import RealTime
 from dora_systemd.errors import DoraSystemdError
 
 _CPUS = "sys/devices/system/cpu"

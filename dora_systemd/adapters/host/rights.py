@@ -8,15 +8,15 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.process import Completed, run_command
 from dora_systemd.decisions.cell.limits import CPUS, NodeLimits
-from dora_systemd.decisions.rights.commands import (
+from dora_systemd.decisions.cell.rights import (
     OTHERS,
     Base,
+    NodeRights,
     described,
     limits_of_others,
     oom_of,
     rights_commands,
 )
-from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.values import cpu_bits, cpu_numbers, format_cpus

@@ -25,7 +25,7 @@ from dora_systemd.decisions.logs.query import (
     scope_matches,
     start_matches,
 )
-from dora_systemd.decisions.views.journal import Place
+from dora_systemd.decisions.views.findings import Place
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
 from dora_systemd.scope import Scope

@@ -21,13 +21,12 @@ from pathlib import Path
 from dora_systemd.adapters.logs.held import HeldLines, held_path, read_held
 from dora_systemd.adapters.logs.queue import Journal, LogQueue
 from dora_systemd.adapters.logs.source import CHUNK, PIPE_SIZE, OnLine, Pipe, Source, fifos
-from dora_systemd.decisions.cell.counters import WHOLE_CELL, LineCount
-from dora_systemd.decisions.cell.line_rates import RateLimit, format_rate
+from dora_systemd.decisions.cell.line_rates import LineLimiter, RateLimit, format_rate
 from dora_systemd.decisions.logs.events import event_fields
 from dora_systemd.decisions.logs.fields import Value, encode_entry
-from dora_systemd.decisions.logs.limiter import LineLimiter
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin, dora_log_fields
 from dora_systemd.decisions.logs.noise import is_end_of
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, LineCount
 from dora_systemd.paths import CellPaths
 
 # Bytes: a child process that outlives its node may keep writing, and drain() must still return.

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.logs.held import HeldLines
-from dora_systemd.decisions.cell.line_rates import RateLimit
-from dora_systemd.decisions.logs.limiter import LineLimiter
+from dora_systemd.decisions.cell.line_rates import LineLimiter, RateLimit
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin
 from dora_systemd.paths import CellPaths
 

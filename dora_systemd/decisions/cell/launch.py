@@ -14,15 +14,13 @@ from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owed import base_of
+from dora_systemd.decisions.cell.owes import base_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS
 from dora_systemd.decisions.cell.uv import Read, uv_project
-from dora_systemd.decisions.descriptor.arguments import split_arguments
-from dora_systemd.decisions.descriptor.build_session import BuildSession
-from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.descriptor.dataflow import BuildSession, Dataflow
 from dora_systemd.decisions.descriptor.expansion import expanded
-from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
-from dora_systemd.decisions.signs.watchdogs import watchdog_of
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind, split_arguments
+from dora_systemd.decisions.watchdog.watchdogs import watchdog_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, quoted, shown
 

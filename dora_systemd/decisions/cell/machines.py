@@ -1,11 +1,11 @@
-"""Which machine runs which node, where a dataflow has several: the words of runner and doractl.
+"""Which machine runs which node, where a dataflow has several, and which ones are missing. Pure.
 
 The machine on which `doractl start` runs is the head. Every other one is a member, and has a name.
 They are part of the runner's command line, which `list` parses: imports only what loads quickly.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -68,3 +68,25 @@ def placed_on(placed: Sequence[Placed], node: str) -> str:
 
 def _refusal(text: str, hint: str) -> DoraSystemdError:
     return DoraSystemdError(f"cannot use {quoted(text)} as a machine", hint, ExitCode.USAGE)
+
+
+NOT_CONNECTED = "it is not connected yet"
+NOT_JOINED = "it has not answered yet"
+USUAL = (NOT_CONNECTED, NOT_JOINED)
+"""What each start waits for, for a moment."""
+ENDED = "the connection has ended"
+"""Of a link before it says more."""
+_BEGIN = "waiting for machine"
+
+
+def format_missing(missing: Mapping[str, str]) -> str:
+    """The machines that are missing, by name, and why."""
+    word = "machine" if len(missing) == 1 else "machines"
+    return f"{word} {', '.join(f'{name} ({why})' for name, why in missing.items())}"
+
+
+def is_news(text: str) -> bool:
+    """Whether the stage of a start is more than what each start waits for."""
+    for one in (*USUAL, ENDED):
+        text = text.replace(f"({one})", "")
+    return text.startswith(_BEGIN) and "(" in text

@@ -36,8 +36,8 @@ from dora_systemd.values import (
 )
 
 if TYPE_CHECKING:  # few dataflows have any, and `list` loads this module
-    from dora_systemd.decisions.cell.owed import Owed
-    from dora_systemd.decisions.rights.node_rights import NodeRights
+    from dora_systemd.decisions.cell.owes import Owed
+    from dora_systemd.decisions.cell.rights import NodeRights
 
 RUNNER_MODULE = "dora_systemd.runner"
 DEFAULT_GRACE = 10 * SECOND
@@ -66,7 +66,7 @@ class RunnerOptions(NamedTuple):
     node_restarts: policies of single nodes.
     start_timeout: µs for all nodes to become ready, or INFINITY.
     reload: files that cause a reload, and how nodes are replaced.
-    watchdogs: nodes with a notify socket, see dora_systemd.decisions.signs.watchdogs.
+    watchdogs: nodes with a notify socket, see dora_systemd.decisions.watchdog.watchdogs.
     owes: outputs of nodes that have to come in time.
     needs: the paths that single nodes wait for.
     placed: the nodes that run on other machines than the head.
@@ -159,14 +159,14 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
     return call
 
 
-_parse_rights = _late("rights.node_rights", "parse_node_rights")
-_format_rights = _late("rights.node_rights", "format_node_rights")
-_parse_owed, _format_owed = (_late("cell.owed", name) for name in ("parse_owed", "format_owed"))
-_parse_watchdogs = _late("signs.watchdogs", "parse_sockets")
+_parse_rights = _late("cell.rights", "parse_node_rights")
+_format_rights = _late("cell.rights", "format_node_rights")
+_parse_owed, _format_owed = (_late("cell.owes", name) for name in ("parse_owed", "format_owed"))
+_parse_watchdogs = _late("watchdog.watchdogs", "parse_sockets")
 
 
 def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
-    return _late("signs.watchdogs", "format_watchdogs")(watchdogs) if watchdogs else []
+    return _late("watchdog.watchdogs", "format_watchdogs")(watchdogs) if watchdogs else []
 
 
 _REQUIRED = ("name", "uuid", "working-directory", "dora")

@@ -1,11 +1,15 @@
-"""The live table of one cell: the runner writes it to status.json, and `list` reads it."""
+"""The live table of one cell: the runner writes it to status.json, and `list` reads it. Pure.
+
+NodeAsked of life/events.py says that a restart or a stop of a node was requested, before it is
+done. The table keeps that: what counts, shows or judges an end calls was_asked() or is_stopped().
+"""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
-from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample, LineCount
 from dora_systemd.decisions.cell.exits import Exit, parse_exit
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, LineCount
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id
 
@@ -67,7 +71,7 @@ class NodeStatus(NamedTuple):
     window, 0 without limit. hung: why dora's health check or its watchdog ended the process, or "".
     silent: which output that it owes has not come, or "". is_ended: the runner ends it for that.
     needs: what it waits for, or "". machine: the name of the other machine that it runs on, or "".
-    asked: what was asked for, for decisions/cell/asked.py, or "". asked_by: by whom. is_held:
+    asked: what was asked for, for decisions/cell/status.py, or "". asked_by: by whom. is_held:
     whether dora only has a launcher of it, which waits because a stop was asked for.
     """
 
@@ -102,7 +106,7 @@ class CellStatus(NamedTuple):
     SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL.
     up_us: CLOCK_MONOTONIC µs of READY=1, 0 before it, and in tables of older versions. is_first:
     whether NRestarts= of the unit is certainly 0. signs: of nodes with a notify socket, for
-    parse_sign() of dora_systemd.decisions.signs.table. usage: of nodes on other machines, for
+    parse_sign() of dora_systemd.decisions.watchdog.messages. usage: of nodes on other machines, for
     parse_use() of dora_systemd.decisions.machines.usage.
     """
 
@@ -282,3 +286,42 @@ def _checked(value: Any, most: int) -> int:
     if type(value) is not int or not 0 <= value <= most:
         raise _Wrong("it has a number that cannot be")
     return value
+
+
+RESTART, STOP = "restart", "stop"
+
+
+def was_asked(node: NodeStatus) -> bool:
+    """Whether an end of the node's process is what somebody has asked for.
+
+    A restart covers the process that it ends, and not the next one: that can crash.
+    """
+    return is_stopped(node) or (node.asked == RESTART and node.state == "reloading")
+
+
+def is_stopped(node: NodeStatus) -> bool:
+    """Whether somebody has stopped the node, and nobody has started it again."""
+    return node.asked == STOP
+
+
+def is_stopping(node: NodeStatus) -> bool:
+    """Whether a node that somebody has stopped has still a process, other than its launcher."""
+    return is_stopped(node) and bool(node.pid) and not node.is_held
+
+
+def format_stopped(stopped: Mapping[str, str]) -> str:
+    """As "plot, requested by root (doractl node stop)"; "" if nobody has stopped a node.
+
+    stopped: by node, who has asked for its stop, or "".
+    """
+    by = dict.fromkeys(filter(None, stopped.values()))
+    parts = (
+        (", ".join(node for node, one in stopped.items() if one == who), format_asked(who))
+        for who in by
+    )
+    return "; ".join(f"{nodes}, {asked}" for nodes, asked in parts)
+
+
+def format_asked(by: str) -> str:
+    """Who has asked, as in "requested by root (doractl node stop)"."""
+    return f"requested by {by}"

@@ -2,10 +2,13 @@
 
 The checks report errors in one line for which dora prints ten lines, or nothing: `nodes: []` would
 run forever, and only `dora validate` finds an input without a source. dora checks everything else.
+
+Also here: which nodes depend on which, and what `dora build` saves beside the descriptor.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import PurePath
 from typing import Any
 
 from dora_systemd.decisions.descriptor.json_size import check_json, is_infinite, refusal
@@ -125,3 +128,56 @@ def _missing(source: str, nodes: Mapping[str, Node]) -> str:
     if node.kind in UNEXPANDED or node.kind == NodeKind.ROS2 or output in node.outputs:
         return ""
     return "an output that it does not declare"
+
+
+Downstream = Mapping[str, tuple[str, ...]]
+"""Node id -> the nodes that depend on its outputs, nearest first."""
+
+
+def downstream_of(dataflow: Dataflow) -> Downstream:
+    """The nodes downstream of each node, directly or indirectly; a circle ends at its start."""
+    takers: dict[str, list[str]] = {node.id: [] for node in dataflow.nodes}
+    for node in dataflow.nodes:
+        for origin in {one.source.partition("/")[0] for one in node.inputs}:
+            takers.setdefault(origin, []).append(node.id)
+    return {node.id: _reached(node.id, takers) for node in dataflow.nodes}
+
+
+def _reached(start: str, takers: Mapping[str, list[str]]) -> tuple[str, ...]:
+    found, waiting = {start}, [start]
+    for node in waiting:  # the list grows during the loop
+        new = [one for one in takers.get(node, ()) if one not in found]
+        found.update(new)
+        waiting += new
+    return tuple(waiting[1:])
+
+
+@dataclass(frozen=True)
+class BuildSession:
+    """The results of the last `dora build`, by node id, as absolute paths. `dora start` uses them.
+
+    directories: where a node runs; for one from git that is its clone. envs: virtual environments
+    of `dora build --uv`; without --uv they do not exist.
+    """
+
+    directories: Mapping[str, str] = field(default_factory=dict)
+    envs: Mapping[str, str] = field(default_factory=dict)
+
+
+def session_path(dataflow: str) -> PurePath:
+    """The session file of the descriptor at `dataflow`."""
+    path = PurePath(dataflow)
+    return path.parent / "out" / f"{path.stem}.dora-session.yaml"
+
+
+def parse_session(document: object) -> BuildSession:
+    """The session in a loaded YAML document; empty if dora did not write it."""
+    build = document.get("local_build") if isinstance(document, dict) else None
+    if not isinstance(build, dict):
+        return BuildSession()
+    directories, envs = (build.get(key) for key in ("node_working_dirs", "python_env_dirs"))
+    return BuildSession(_texts(directories), _texts(envs))
+
+
+def _texts(value: object) -> dict[str, str]:
+    return {str(key): str(text) for key, text in value.items()} if isinstance(value, dict) else {}

@@ -1,5 +1,6 @@
-"""The nodes of a descriptor; the module dataflow has the descriptor as a whole."""
+"""The nodes of a descriptor, and the words of `args:`; dataflow.py has the whole descriptor."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -199,3 +200,54 @@ def described(value: object) -> str:
         return f"the text {quoted(value)}"
     words = {dict: "a mapping", list: "a list", bool: "true or false", type(None): "nothing"}
     return words.get(type(value), "a number")
+
+
+_BLANKS = " \t\n"
+_GAP = re.compile(r"(?:[ \t\n]|#[^\n]*)*")
+"""Between words. A "#" that begins a word begins a comment."""
+_PIECE = re.compile(
+    r"""'(?P<literal>[^']*)'|"(?P<quoted>(?:[^"\\]|\\.)*)"|\\(?P<one>.)|(?P<plain>[^ \t\n'"\\]+)""",
+    re.DOTALL,
+)
+_ESCAPE = re.compile(r'\\(?:\n|([$`"\\]))')
+"""In double quotes; before any other character a backslash is itself."""
+
+
+def split_arguments(text: str) -> list[str]:
+    """Split `args:` of a node into words as dora's daemon does, by the rules of Rust's crate shlex.
+
+    Python's shlex differs: there "#" begins no comment, a carriage return separates words, a
+    backslash before a newline keeps the newline, and in double quotes it also escapes nothing but
+    '"' and itself. Raises ValueError for an open quote and for a backslash at the end.
+    """
+    words = []
+    place = _end_of_gap(text, 0)
+    while place < len(text):
+        word, place = _next_word(text, place)
+        words.append(word)
+        place = _end_of_gap(text, place)
+    return words
+
+
+def _end_of_gap(text: str, place: int) -> int:
+    match = _GAP.match(text, place)
+    return match.end() if match else place
+
+
+def _next_word(text: str, place: int) -> tuple[str, int]:
+    """The word that begins at `place`, and where it ends."""
+    word = ""
+    while place < len(text) and text[place] not in _BLANKS:
+        piece = _PIECE.match(text, place)
+        if piece is None:
+            raise ValueError("a backslash ends it" if text[place] == "\\" else "a quote is open")
+        word += _value(piece)
+        place = piece.end()
+    return word, place
+
+
+def _value(piece: re.Match[str]) -> str:
+    text = piece[0] if piece.lastgroup is None else piece[piece.lastgroup]
+    if piece.lastgroup == "quoted":
+        return _ESCAPE.sub(lambda match: match[1] or "", text)
+    return "" if piece.lastgroup == "one" and text == "\n" else text

@@ -22,7 +22,7 @@ It receives:
   graph     {dataflow, nodes, edges, problem}
   about     {dataflow, row, why, facts, problem}
                                               row: as `list` has it, with the nodes of an ended one;
-                                              why: as in report_object; facts: see page_facts
+                                              why: as in report_object; facts: see fact_values()
   ended     {dataflows, problem}              those that systemd has unloaded, newest first
   releases  {dataflow, releases, problem}     as `doractl releases -o json` has them, newest first
   lines     {number, lines, skipped}          lines: {at_us, node, text, priority, event};
@@ -43,12 +43,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from dora_systemd.decisions.cell.environment import with_changes
+from dora_systemd.decisions.cell.limits import LIMITS, Limit, NodeLimits, format_node_limits
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.logs.records import Record, record_text
 from dora_systemd.decisions.settings.limits import LIVE_SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, one_line, without_sequences
-from dora_systemd.values import format_moment
+from dora_systemd.values import INFINITY, format_moment
 
 TYPES = ("follow", "find", "save", "unfollow", "graph", "about", "ended", "releases", "act")
 ACTIONS = ("stop", "start", "restart", "enable", "disable", "reload", "set", "rollback")
@@ -161,3 +164,53 @@ def graph_values(dataflow: Dataflow) -> dict[str, Any]:
 def _edge(node: str, name: str, source: str) -> dict[str, str]:
     origin, _, output = (source, "", "") if source.startswith("dora/") else source.partition("/")
     return {"from": origin, "output": output, "to": node, "input": name}
+
+
+_LEVEL = ("NoNewPrivileges", "MemoryDenyWriteExecute")
+_NETWORK = ("PrivateNetwork", "IPAddressDeny")
+
+
+def _read_as(limit: Limit) -> str:
+    """The property of the limit on D-Bus, see org.freedesktop.systemd1(5)."""
+    return "CPUQuotaPerSecUSec" if limit.property == "CPUQuota" else limit.property
+
+
+PROPERTIES = (*map(_read_as, LIMITS), *_LEVEL, *_NETWORK, "Environment")
+"""What fact_values() needs of the unit."""
+
+
+def fact_values(options: RunnerOptions, unit: Mapping[str, Any]) -> dict[str, Any]:
+    """Limits and switches, with the keys of the settings; texts as `doractl set` takes them.
+
+    unit: its PROPERTIES. Raises DoraSystemdError for an Environment= that is not ours.
+    """
+    environment = dict(one.partition("=")[::2] for one in unit["Environment"] or ())
+    now = with_changes(options, environment)
+    limits = {one: unit[_read_as(one)] for one in LIMITS}
+    nodes = map(_finite, now.node_limits)
+    return {
+        **{one.key: one.format(value) for one, value in limits.items() if _is_set(value)},
+        "node_limit": [format_node_limits(one) for one in nodes if one.limits],
+        "hot_reload": now.hot_reload,
+        "sandbox": _level(unit),
+        "network": _network(unit),
+    }
+
+
+def _finite(one: NodeLimits) -> NodeLimits:
+    return one._replace(limits=tuple(pair for pair in one.limits if pair[1] != INFINITY))
+
+
+def _is_set(value: object) -> bool:
+    return isinstance(value, int) and value != INFINITY
+
+
+def _level(unit: Mapping[str, Any]) -> str:
+    """The level of the sandbox, by a property that only it and those above it have."""
+    is_on, is_strict = (unit[one] for one in _LEVEL)
+    return "strict" if is_on and is_strict else "default" if is_on else "none"
+
+
+def _network(unit: Mapping[str, Any]) -> str:
+    is_private, denied = (unit[one] for one in _NETWORK)
+    return "private" if is_private else "loopback" if denied else "host"

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.status import NodeStatus
-from dora_systemd.decisions.descriptor.wiring import Downstream
+from dora_systemd.decisions.descriptor.dataflow import Downstream
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.resources.oom import Oom
 
@@ -120,7 +120,7 @@ class NodeHung(Event):
 class NodeSilent(Event):
     """An output that the node owes has not come. reason: such as "no image for 2s".
 
-    then: one of dora_systemd.decisions.cell.owed.THEN. silent: all that is missing of the node.
+    then: one of dora_systemd.decisions.cell.owes.THEN. silent: all that is missing of the node.
     """
 
     node: str
@@ -211,8 +211,8 @@ class StopAnswered(Event):
 class NodeAsked(Event):
     """Somebody has asked for a restart or a stop of one node; it follows.
 
-    what: RESTART or STOP of asked.py. by: who, and by which door. status: the initial status of the
-    next process after a restart.
+    what: RESTART or STOP of cell/status.py. by: who, and by which door. status: the initial status
+    of the next process after a restart.
     """
 
     node: str

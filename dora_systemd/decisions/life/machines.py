@@ -12,7 +12,7 @@ from dataclasses import replace
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import handlers as handle
-from dora_systemd.decisions.life import nodes as table
+from dora_systemd.decisions.life import node_table as table
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import (
     ENGINE_TIMEOUT,

@@ -9,7 +9,7 @@ from dora_systemd.decisions.life.causes import Cause
 
 if TYPE_CHECKING:  # doractl needs only RunnerExit
     from dora_systemd.decisions.cell.status import NodeStatus
-    from dora_systemd.decisions.descriptor.wiring import Downstream
+    from dora_systemd.decisions.descriptor.dataflow import Downstream
 
 
 class RunnerExit(IntEnum):

@@ -9,7 +9,7 @@ Every pair of state and event has an entry in TABLE; its unit test takes them al
 from collections.abc import Mapping
 
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life import failures, machines, running
+from dora_systemd.decisions.life import failures, machines
 from dora_systemd.decisions.life import handlers as handle
 from dora_systemd.decisions.life.failures import Handler, Next
 from dora_systemd.decisions.life.states import Cell, State
@@ -70,10 +70,10 @@ _ALIVE: dict[str, Handler] = {
 _RUNNING: dict[str, Handler] = {
     **_ALIVE,
     **_RELOADS,
-    "NodeExited": running.node_exited,
-    "NodeReloading": running.node_reloading,
-    "NodeAdded": running.node_reloading,
-    "ReloadNoted": running.reload_noted,
+    "NodeExited": handle.node_exited,
+    "NodeReloading": handle.node_reloading,
+    "NodeAdded": handle.node_reloading,
+    "ReloadNoted": handle.reload_noted,
 }
 _STOPPING: dict[str, Handler] = {
     **dict.fromkeys(_NODES, handle.node_event_stopping),
@@ -108,7 +108,7 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
     ),
     State.RUNNING: _row(
         **_RUNNING,
-        NodeSilent=running.silent,
+        NodeSilent=handle.silent,
         NodeSpeaks=handle.node_event,
     ),
     State.STOPPING: _row(**_STOPPING),

@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dora_systemd.decisions.cell.asked import is_stopped
-from dora_systemd.decisions.cell.counters import CpuSample, LineCount
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS, LATCH_SECONDS
 from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
@@ -14,12 +12,14 @@ from dora_systemd.decisions.cell.status import (
     UNMET,
     CellStatus,
     NodeStatus,
+    is_stopped,
 )
-from dora_systemd.decisions.life.nodes import WITH_PROCESS, is_held_up, lacking
+from dora_systemd.decisions.life.node_table import WITH_PROCESS, is_held_up, lacking
 from dora_systemd.decisions.life.states import Cell, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import kill_delay
-from dora_systemd.decisions.needs.words import format_wait
-from dora_systemd.decisions.signs.table import Sign
+from dora_systemd.decisions.needs.waiting import format_wait
+from dora_systemd.decisions.resources.usage import CpuSample, LineCount
+from dora_systemd.decisions.watchdog.messages import Sign
 from dora_systemd.values import INFINITY, format_duration
 
 _SHOWN = {

@@ -1,12 +1,15 @@
-"""Records of the journal as messages of dora's log stream, in dora's form and words."""
+"""Records of the journal as messages of dora's log stream, and which of them to show. Pure."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
+from dora_systemd.decisions.cell.machines import Placed, members_of
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import shown_log
-from dora_systemd.values import format_moment
+from dora_systemd.values import format_moment, quoted
 
 Record = Mapping[str, bytes]
 """An entry of the journal in the export format."""
@@ -91,3 +94,62 @@ def record_text(record: Record, name: str) -> str:
 def timestamp(record: Record) -> str:
     """When journald got it, as in RFC 3339, in UTC."""
     return format_moment(int(record.get("__REALTIME_TIMESTAMP", b"0")))
+
+
+RAW = "stdout"
+"""The level that shows everything, also raw lines of nodes, which have no level of their own."""
+FILTER_LEVELS = (*DORA_LEVELS[1:], RAW)
+
+
+@dataclass(frozen=True)
+class LogFilter:
+    """The levels to show. nodes: those of single nodes by id; level: of all other records."""
+
+    level: str = RAW
+    nodes: Mapping[str, str] = field(default_factory=dict)
+
+    def shows(self, record: Record) -> bool:
+        """Whether to show the record: raw lines only at the level "stdout", as in dora."""
+        asked = self.nodes.get(record_text(record, "DORA_NODE"), self.level)
+        own = level_of(record)
+        return asked == RAW or own in DORA_LEVELS[: DORA_LEVELS.index(asked) + 1]
+
+
+def parse_filter(text: str) -> dict[str, str]:
+    """The level of each node in "NODE=LEVEL,...". Raises DoraSystemdError (USAGE)."""
+    return dict(_parsed(pair) for one in text.split(",") if (pair := one.strip()))
+
+
+def _parsed(pair: str) -> tuple[str, str]:
+    node, _, level = (part.strip() for part in pair.partition("="))
+    level = level.lower()
+    if not node or level not in FILTER_LEVELS:
+        hint = f"write NODE=LEVEL,...; levels: {', '.join(FILTER_LEVELS)}"
+        raise DoraSystemdError(f"cannot read {quoted(pair)} as a log filter", hint, ExitCode.USAGE)
+    return node, level
+
+
+_NOTICE = b"5"
+
+
+def lines_elsewhere(name: str, placed: Sequence[Placed], node: str, at_us: int) -> list[Record]:
+    """One record for a dataflow, or a node, with lines on other machines; else none.
+
+    The gateway cannot read them: it has no keys, and its unit no network. node: "" for all.
+    at_us: now, CLOCK_REALTIME.
+    """
+    away = [one for one in placed if node in ("", one.node)]
+    if not away:
+        return []
+    machines = members_of(away)
+    where = f"machine {machines[0]}" if len(machines) == 1 else f"machines {', '.join(machines)}"
+    which = f" --node {node}" if node else ""
+    text = f"more lines are in the journal of {where}: doractl logs {name}{which}"
+    return [
+        {
+            "__REALTIME_TIMESTAMP": b"%d" % at_us,
+            "MESSAGE": text.encode(),
+            "PRIORITY": _NOTICE,
+            **({"DORA_NODE": node.encode()} if node else {}),
+        }
+    ]

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.machines.wire import PORT_RANGE, Forwards
-from dora_systemd.decisions.remote.command import Way, remote_command
-from dora_systemd.decisions.remote.hosts import parse_host
+from dora_systemd.decisions.remote.hosts import Way, parse_host, remote_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 _PROGRAMS = Path(__file__).parents[2] / "link"

@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.line_rates import ALL_NODES, RateLimits
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.machines.entry import Machine
 from dora_systemd.decisions.remote.hosts import Host
-from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.owes import NOTIFY, WATCHDOG
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.sandbox import SANDBOX
-from dora_systemd.decisions.settings.signs import NOTIFY, WATCHDOG
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
     ENV,
@@ -28,7 +28,7 @@ from dora_systemd.decisions.settings.table import (
     UV,
     WORKING_DIRECTORY,
 )
-from dora_systemd.decisions.signs.watchdogs import OFF, Watchdogs, watchdog_of
+from dora_systemd.decisions.watchdog.watchdogs import OFF, Watchdogs, watchdog_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
 

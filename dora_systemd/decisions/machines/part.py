@@ -1,10 +1,14 @@
-"""The part of a dataflow that one machine runs, and the nodes of others as dora gets them. Pure.
+"""The part of a dataflow that one machine runs, and whether its nodes run the head's files. Pure.
 
-The member writes how each of its nodes is started, from what it finds on its own disk.
+A member writes how each of its nodes is started, from what it finds on its own disk. It reports the
+digests of its programs, and of what these import, by their path relative to the dataflow file. A
+file that the head does not have proves nothing: it may be for that machine only.
 """
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import PurePosixPath
 from typing import Any
 
 from dora_systemd.decisions.cell.launch import (
@@ -13,11 +17,27 @@ from dora_systemd.decisions.cell.launch import (
     is_launched,
     launcher_words,
 )
-from dora_systemd.decisions.cell.machines import placed_on
+from dora_systemd.decisions.cell.machines import HEAD, machine_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.machines.own import is_here
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import short_line
+
+
+def is_here(options: RunnerOptions, node: str) -> bool:
+    """Whether this machine runs the node."""
+    return machine_of(options.placed, node) == (options.machine or HEAD)
+
+
+def own_options(options: RunnerOptions) -> RunnerOptions:
+    """The options with what they say of this machine's nodes only."""
+    return options._replace(
+        node_limits=tuple(one for one in options.node_limits if is_here(options, one.node)),
+        node_rights=tuple(one for one in options.node_rights if is_here(options, one.node)),
+        needs=tuple(one for one in options.needs if is_here(options, one.node)),
+        watchdogs={node: one for node, one in options.watchdogs.items() if is_here(options, node)},
+    )
+
 
 COPY_HINT = "copy the directory of the dataflow to that machine"
 
@@ -70,3 +90,56 @@ def _launch_file(words: list[str]) -> str:
 
 def _perl_text(text: str) -> str:
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+MOST_FILES = 500
+_NAMED = 3
+_LONGEST = 100
+_DIGEST = 64
+"""Hexadecimal digits of SHA-256."""
+
+Digests = Mapping[str, str]
+"""SHA-256 by relative path."""
+
+
+def format_digests(digests: Digests) -> str:
+    """The text for wire.Programs."""
+    return json.dumps(dict(list(digests.items())[:MOST_FILES]))
+
+
+def parse_digests(text: str) -> dict[str, str]:
+    """The digests of a member, which can lie: without what is no path below the dataflow file.
+
+    Raises ValueError for another text.
+    """
+    found = json.loads(text)
+    if not isinstance(found, dict):
+        raise ValueError(text)
+    return {path: one for path, one in list(found.items())[:MOST_FILES] if _is_digest(path, one)}
+
+
+def _is_digest(path: str, digest: object) -> bool:
+    is_hex = isinstance(digest, str) and len(digest) == _DIGEST
+    pure = PurePosixPath(path)
+    return is_hex and "\0" not in path and not pure.is_absolute() and ".." not in pure.parts
+
+
+def differing(here: Digests, there: Digests) -> list[str]:
+    """The files that both machines have, and that are not the same."""
+    return sorted(path for path, one in there.items() if here.get(path, one) != one)
+
+
+def format_differing(found: Mapping[str, Sequence[str]]) -> str:
+    """One line for people; "" if nothing differs. found: by machine."""
+    parts = (
+        f"machine {machine} runs another {_names(files)} than the one here"
+        for machine, files in found.items()
+        if files
+    )
+    return "; ".join(parts)
+
+
+def _names(files: Sequence[str]) -> str:
+    names = ", ".join(short_line(one, _LONGEST) for one in files[:_NAMED])
+    more = len(files) - _NAMED
+    return f"{names} and {more} more" if more > 0 else names

@@ -7,8 +7,8 @@ from pathlib import PurePath
 
 from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT
-from dora_systemd.decisions.remote.failures import SSH_FAILED, last_line, unreached
 from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.ssh_failures import SSH_FAILED, last_line, unreached
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.terminal_text import short_line

@@ -7,10 +7,15 @@ numbers only have to be ones that can be.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.counters import CpuSample, cpu_percent, throttled_percent
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
-from dora_systemd.decisions.resources.usage import Usage, usage_facts
-from dora_systemd.decisions.signs.table import parse_sign
+from dora_systemd.decisions.resources.usage import (
+    CpuSample,
+    Usage,
+    cpu_percent,
+    throttled_percent,
+    usage_facts,
+)
+from dora_systemd.decisions.watchdog.messages import parse_sign
 from dora_systemd.values import INFINITY
 
 _MOST = INFINITY // 2

@@ -116,7 +116,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Programs:
-    """Member to head: the digests of what its nodes run, see decisions/machines/programs.py."""
+    """Member to head: the digests of what its nodes run, see decisions/machines/part.py."""
 
     digests: str
 

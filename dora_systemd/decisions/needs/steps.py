@@ -4,8 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from dora_systemd.decisions.cell.asked import is_stopped
-from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
+from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus, is_stopped
 
 _WITH_PROGRAM = ("starting", "ready", "running", "restarting")
 

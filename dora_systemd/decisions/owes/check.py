@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owed import RESTART, Owed, is_probe
+from dora_systemd.decisions.cell.owes import RESTART, Owed, is_probe
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import check_known, did_you_mean

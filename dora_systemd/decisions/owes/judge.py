@@ -6,14 +6,14 @@ for each look, and nothing while the probe does not note its beat. So none of th
 a node: a suspended machine, a cell that a signal or the freezer has stopped, a clock that was set,
 a runner or a probe that gets no CPU time.
 
-A silent node whose own inputs are silent is starved, see feeds.py: its process is not at fault.
+A silent node whose own inputs are silent is starved, see probe.py: its process is not at fault.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from dora_systemd.decisions.cell.owed import STARVED, Owed
-from dora_systemd.decisions.owes.feeds import NO_FEEDS, Feeds, Flow, starved_of
+from dora_systemd.decisions.cell.owes import STARVED, Owed
+from dora_systemd.decisions.owes.probe import NO_FEEDS, Feeds, Flow, starved_of
 from dora_systemd.values import SECOND, format_duration
 
 _LOOKS = 8

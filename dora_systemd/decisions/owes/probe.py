@@ -1,4 +1,4 @@
-"""The probe: the node that hears what nodes owe, and notes when. Pure.
+"""The probe: the node that receives what nodes owe, and what it tells of their inputs. Pure.
 
 dora has no counter for an output, and inspection of topics copies every message to the coordinator.
 A node beside the others with `queue_size: 1` leaves the path of the messages as it is: dora passes
@@ -7,16 +7,19 @@ for each node. The runner adds it when all nodes are ready, so it delays no star
 benchmarks/README.md has what it costs.
 
 The probe and the runner share a file of times: 8 bytes for the beat of the probe, then 8 for each
-owed output, in their order, and for each other input of the nodes that owe them, see feeds.py;
-CLOCK_MONOTONIC in µs, 0 is never. Nothing else passes between them.
+owed output, in their order, and for each other input of the nodes that owe them; CLOCK_MONOTONIC in
+µs, 0 is never. Nothing else passes between them. A node that owes an output, and gets no input
+itself, is starved.
 """
 
 import shlex
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from dora_systemd.decisions.cell.owed import PROBE
+from dora_systemd.decisions.cell.owes import PROBE, Owed
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, downstream_of
 from dora_systemd.values import SECOND
 
 _SLOT = struct.Struct("=Q")
@@ -68,3 +71,89 @@ def parse_times(data: bytes, slots: int, now_us: int) -> tuple[int, tuple[int, .
     own = data[: size_of_times(slots)]
     beat, *heard = (one if one <= now_us + SECOND else 0 for (one,) in _SLOT.iter_unpack(own))
     return beat, tuple(heard)
+
+
+MOST_FEEDS = 64
+"""Maximum inputs that are watched, besides owed outputs."""
+_REGULAR = 4
+"""Times `within` after which an input without a gap counts as regular."""
+
+
+@dataclass(frozen=True)
+class Feeds:
+    """The inputs of owing nodes that the probe hears.
+
+    places: NODE/OUTPUT of each slot in the file of times: the owed outputs, then the others.
+    by_node: the slots of the inputs of each owing node. whole: the nodes of which every input is
+    heard: none is a timer, or comes from another machine.
+    """
+
+    places: tuple[str, ...] = ()
+    by_node: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    whole: frozenset[str] = frozenset()
+
+
+NO_FEEDS = Feeds()
+
+
+@dataclass(frozen=True)
+class Flow:
+    """What is known of one input. Times in µs.
+
+    heard: its last message, CLOCK_MONOTONIC. steady: how long messages came without a gap longer
+    than `within`. quiet: time that counts since the last message.
+    """
+
+    heard: int = 0
+    steady: int = 0
+    quiet: int = 0
+
+    def after(self, heard: int, step: int, within: int) -> "Flow":
+        """The flow after a look. step: µs that count."""
+        quiet = self.quiet + step
+        if heard > self.heard:
+            return Flow(heard, 0 if quiet > within else self.steady + quiet)
+        return replace(self, quiet=quiet)
+
+
+def find_feeds(owes: Sequence[Owed], dataflow: Dataflow, is_here: Callable[[str], bool]) -> Feeds:
+    """The feeds of the nodes in `owes`. is_here: whether this machine runs that node.
+
+    A message from another machine would take the network once more. In a circle the input of a node
+    ends because its output does, so it proves nothing.
+    """
+    slots = {one.place: at for at, one in enumerate(owes)}
+    owing, downstream = {one.node for one in owes}, downstream_of(dataflow)
+    by_node: dict[str, tuple[int, ...]] = {}
+    whole = set[str]()
+    for node in dataflow.nodes:
+        if node.id not in owing:
+            continue
+        places = sorted({one.source for one in node.inputs})
+        never = {"dora", node.id, *downstream[node.id]}
+        heard = [one for one in places if _origin(one) not in never and is_here(_origin(one))]
+        heard = [one for one in heard if one in slots or len(slots) < len(owes) + MOST_FEEDS]
+        by_node[node.id] = tuple(slots.setdefault(one, len(slots)) for one in heard)
+        whole |= {node.id} if places and len(heard) == len(places) else set()
+    return Feeds(tuple(slots), by_node, frozenset(whole))
+
+
+def starved_of(
+    flows: Sequence[Flow], quiet: int, tick: int, owed: Owed, is_first: bool, is_whole: bool
+) -> int | None:
+    """Which of the flows a silent node lacks; None if the silence is its own.
+
+    quiet: µs since its last message, or since its start if is_first. It is starved if nothing at
+    all came in since then, or if a regular input ended when its output did.
+    """
+    least = quiet - 2 * tick
+    ended = [at for at, one in enumerate(flows) if one.quiet >= least]
+    if is_whole and ended and len(ended) == len(flows):
+        return ended[0]
+    most = quiet + owed.within
+    regular = (at for at in ended if flows[at].steady >= _REGULAR * owed.within)
+    return next((at for at in regular if is_first or flows[at].quiet <= most), None)
+
+
+def _origin(source: str) -> str:
+    return source.partition("/")[0]

@@ -1,13 +1,19 @@
-"""release.json: what a release is, for people, for a rollback, and to check its files. Pure."""
+"""release.json: what a release is, for people, for a rollback, and to check its files. Pure.
+
+Also makes the id of a release, which names.py reads.
+"""
 
 import json
+import re
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Any
 
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import shown
+from dora_systemd.values import SECOND, shown
 
 SCHEMA = 1
 
@@ -96,3 +102,34 @@ def _text(value: object) -> str:
     if type(value) is not str:
         raise TypeError(value)
     return value
+
+
+_REVISION = re.compile(r"[0-9a-f]{4,64}\+?")
+_MOMENT = "%Y%m%dT%H%M%S"
+_MOMENT_LENGTH = 15
+
+
+def is_revision(text: str) -> bool:
+    """Whether it is a revision of git in hexadecimal digits, "+" behind it for changed files."""
+    return _REVISION.fullmatch(text) is not None
+
+
+def new_id(at_us: int, revision: str, known: frozenset[str]) -> str:
+    """The id of a release of that time, that sorts behind all of `known`.
+
+    at_us: CLOCK_REALTIME µs. revision: of git, or "".
+    """
+    newest = max(known, default="")
+    now = _id(at_us // SECOND, revision)
+    # The clock may have been ahead, or be behind, as without a battery.
+    return now if now > newest else _id(_second_of(newest) + 1, revision)
+
+
+def _id(second: int, revision: str) -> str:
+    moment = time.strftime(_MOMENT, time.gmtime(second))
+    return f"{moment}-{revision}" if revision else moment
+
+
+def _second_of(release_id: str) -> int:
+    moment = datetime.strptime(release_id[:_MOMENT_LENGTH], _MOMENT)
+    return int(moment.replace(tzinfo=UTC).timestamp())

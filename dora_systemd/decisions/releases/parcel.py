@@ -21,8 +21,7 @@ from dora_systemd.decisions.releases.entries import (
     is_plain_path,
     too_many,
 )
-from dora_systemd.decisions.releases.ids import is_revision
-from dora_systemd.decisions.releases.manifest import format_stored, parse_stored
+from dora_systemd.decisions.releases.manifest import format_stored, is_revision, parse_stored
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name
 

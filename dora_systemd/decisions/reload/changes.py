@@ -1,8 +1,9 @@
-"""Decides what must restart after files have changed: as little as possible."""
+"""What must restart after files have changed: as little as possible; the steps for dora. Pure."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import PurePath
 from typing import Any
 
@@ -129,3 +130,39 @@ def _edges(node: Mapping[str, Any]) -> list[Any]:
 
 def _by_id(nodes: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
     return {str(node["id"]): node for node in nodes}
+
+
+class How(Enum):
+    """What happens to a node."""
+
+    REMOVE = "removed"
+    REWIRE = "reconnected"
+    SWAP = "reloaded"
+    OPERATOR = "reloaded in place"
+    ADD = "added"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One node, and the reason: the absolute path of a changed file."""
+
+    how: How
+    node: str
+    file: str
+
+
+def plan_steps(
+    found: Touched, change: Difference, kinds: Mapping[str, str], dataflow: str
+) -> tuple[Step, ...]:
+    """The steps in order, one for each node, without dynamic nodes, which dora does not start.
+
+    kinds: how each node is started, see launch.kinds(). dataflow: path of its file.
+    """
+    changed = {How.REMOVE: change.removed, How.REWIRE: change.rewired, How.SWAP: change.replaced}
+    steps = [Step(how, node, dataflow) for how, nodes in changed.items() for node in nodes]
+    done = {step.node for step in steps}.union(change.added)
+    for node, file in found.nodes.items():
+        if node not in done and kinds.get(node) != "dynamic":
+            how = How.OPERATOR if kinds.get(node) == "operator" else How.SWAP
+            steps.append(Step(how, node, file))
+    return (*steps, *(Step(How.ADD, node, dataflow) for node in change.added))

@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from dora_systemd.decisions.remote.command import NO_PROGRAM
-from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.hosts import NO_PROGRAM, Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_release_id
 

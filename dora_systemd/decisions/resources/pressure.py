@@ -8,7 +8,7 @@ not flooded.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from dora_systemd.decisions.cell.counters import WHOLE_CELL
+from dora_systemd.decisions.resources.usage import WHOLE_CELL
 from dora_systemd.values import SECOND, format_rounded_size
 
 MEMORY, CPU = "memory-pressure", "cpu-throttled"

@@ -12,7 +12,7 @@ from dora_systemd.decisions.cell.limits import (
     merge_node_limits,
     parse_node_limits,
 )
-from dora_systemd.decisions.rights.node_rights import is_negative, parse_nice
+from dora_systemd.decisions.cell.rights import is_negative, parse_nice
 from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text, texts_of_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted

@@ -1,16 +1,26 @@
-"""The setting for outputs that nodes owe."""
+"""The settings of what nodes owe: messages on outputs, and signs of life, see sd_notify(3)."""
 
 from collections.abc import Mapping
+from operator import or_
 from typing import Any
 
-from dora_systemd.decisions.cell.owed import (
+from dora_systemd.decisions.cell.owes import (
     Owed,
     format_owed,
     merge_owed,
     owed_of,
     parse_owed,
 )
-from dora_systemd.decisions.settings.kinds import Base, Kind, Scalar, Setting, listed
+from dora_systemd.decisions.settings.kinds import (
+    BOOL,
+    Base,
+    Kind,
+    Scalar,
+    Setting,
+    listed,
+    many_texts,
+)
+from dora_systemd.decisions.watchdog.watchdogs import Watchdogs, format_watchdogs, parse_watchdogs
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted, scalar_text
 
@@ -65,3 +75,17 @@ def owes_of(nodes: Mapping[str, tuple[Owed, ...]], given: tuple[Owed, ...]) -> t
 
 def _refusal(what: str, hint: str) -> DoraSystemdError:
     return DoraSystemdError(f"cannot use {what} as owes", hint, ExitCode.BAD_INPUT)
+
+
+WATCHDOG = Setting[Watchdogs](
+    "watchdog",
+    many_texts("a time span such as 5s", "[NODE=]TIME", parse_watchdogs, format_watchdogs, or_),
+    {},
+    "Time in which all nodes, or NODE, must send WATCHDOG=1; one that does not is ended.",
+    variable="DORA_WATCHDOG",
+    per_node=True,
+)
+NOTIFY = Setting[bool](
+    "notify", BOOL, False, "Give the nodes a notify socket, to tell their STATUS=.", per_node=True
+)
+SIGN_SETTINGS: tuple[Setting[Any], ...] = (WATCHDOG, NOTIFY)

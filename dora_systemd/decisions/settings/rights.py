@@ -1,8 +1,8 @@
-"""The settings of rights that single nodes have, see dora_systemd.decisions.rights.node_rights."""
+"""The settings of rights that single nodes have, see dora_systemd.decisions.cell.rights."""
 
 from typing import Any
 
-from dora_systemd.decisions.rights.node_rights import (
+from dora_systemd.decisions.cell.rights import (
     BY_KEY,
     RIGHTS,
     NodeRights,

@@ -25,12 +25,11 @@ from dora_systemd.decisions.settings.kinds import (
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, LIVE_SETTINGS
 from dora_systemd.decisions.settings.machines import MACHINE_SETTINGS
 from dora_systemd.decisions.settings.needs import NEED_SETTINGS
-from dora_systemd.decisions.settings.owes import OWES_SETTINGS
+from dora_systemd.decisions.settings.owes import OWES_SETTINGS, SIGN_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.rights import RIGHTS_SETTINGS
 from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
-from dora_systemd.decisions.settings.signs import SIGN_SETTINGS
 
 ENV = Setting[Mapping[str, str]]("env", ENVIRONMENT, {}, "Environment variable of all nodes.")
 ENV_FILE = Setting[tuple[str, ...]](

@@ -14,10 +14,10 @@ from dora_systemd.decisions.cell.options import (
     reload_command,
     runner_command,
 )
+from dora_systemd.decisions.cell.rights import NICE_LIMIT, NodeRights
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.life.stop_budget import unit_timeout
-from dora_systemd.decisions.needs.devices import device_entries
-from dora_systemd.decisions.needs.units import NETWORK_UNIT, needs_properties
+from dora_systemd.decisions.needs.units import NETWORK_UNIT, device_entries, needs_properties
 from dora_systemd.decisions.properties.assignments import (
     Properties,
     format_property,
@@ -30,8 +30,6 @@ from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.sandbox import Sandbox, sandbox_properties
 from dora_systemd.decisions.properties.structs import Command
 from dora_systemd.decisions.properties.table import TABLE
-from dora_systemd.decisions.rights.commands import NICE_LIMIT
-from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.decisions.settings.credentials import credential_properties
 from dora_systemd.decisions.settings.limits import REALTIME
 from dora_systemd.decisions.settings.needs import NEEDS

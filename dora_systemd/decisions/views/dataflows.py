@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from dora_systemd.decisions.needs.words import format_wait
+from dora_systemd.decisions.needs.waiting import format_wait
 from dora_systemd.decisions.views.facts import SILENT
 from dora_systemd.decisions.views.formats import (
     UNKNOWN,

@@ -1,8 +1,8 @@
 """Formats one dataflow and its nodes for `doractl list SELECTOR`."""
 
-from dora_systemd.decisions.cell.asked import format_stopped
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
+from dora_systemd.decisions.cell.status import format_stopped
 from dora_systemd.decisions.views.dataflows import (
     DEGRADED,
     FAILED,

@@ -29,7 +29,7 @@ Sample = tuple[Labels, float | int]
 class OutputRow(NamedTuple):
     """An output that a node owes. within: µs. age: µs since its last message, None: none yet.
 
-    then: one of dora_systemd.decisions.cell.owed.THEN.
+    then: one of dora_systemd.decisions.cell.owes.THEN.
     """
 
     output: str
@@ -142,13 +142,13 @@ def _seconds(time: int | None, **labels: str) -> list[Sample]:
 
 def _state(one: "NodeStatus") -> str:
     # Imported late, as below: a list without dataflows has no node.
-    from dora_systemd.decisions.cell.asked import is_stopping
+    from dora_systemd.decisions.cell.status import is_stopping
 
     return "stopping" if is_stopping(one) else one.state
 
 
 def _stopped_by(one: "NodeStatus") -> str:
-    from dora_systemd.decisions.cell.asked import is_stopped
+    from dora_systemd.decisions.cell.status import is_stopped
 
     return one.asked_by if is_stopped(one) else ""
 

@@ -1,4 +1,7 @@
-"""Who inhibits restarts of a dataflow, for people and for programs. Pure."""
+"""Who inhibits restarts of a dataflow, for people and for programs. Pure.
+
+The kernel knows who holds a lock. The lock file only has the reasons, a line "PID TEXT" for each.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -6,6 +9,7 @@ from typing import Any, NamedTuple
 from dora_systemd.decisions.views.dataflows import format_table
 from dora_systemd.decisions.views.formats import UNKNOWN
 from dora_systemd.decisions.views.rows import Holder
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import cut, short_line
 
 _HEADER = ("NAME", "NODE", "PID", "USER", "COMMAND", "WHY")
@@ -67,3 +71,35 @@ def inhibited_objects(rows: Sequence[Inhibited]) -> list[Mapping[str, Any]]:
         for row in rows
         for holder in row.holders
     ]
+
+
+MAX_REASON = 200
+"""Bytes of a reason that are shown."""
+_MAX_DIGITS = 10
+
+
+def parse_reason(text: str) -> str:
+    """A reason as `--why` takes it, in one line. Raises DoraSystemdError (USAGE) if it is empty."""
+    reason = short_line(text, MAX_REASON)
+    if not reason:
+        hint = "such as --why 'it is driving'"
+        raise DoraSystemdError("cannot inhibit without a reason", hint, ExitCode.USAGE)
+    return reason
+
+
+def format_reason(pid: int, reason: str) -> bytes:
+    """The line of a process in the lock file."""
+    return f"{pid} {reason}\n".encode(errors="replace")
+
+
+def parse_reasons(data: bytes) -> Mapping[int, str]:
+    """The reasons in a lock file by pid, the last line of each; other lines do not count.
+
+    A pid is that of the PID namespace in which the process runs, see pid_namespaces(7).
+    """
+    found = {}
+    for line in data.decode(errors="replace").split("\n"):
+        pid, _, text = line.partition(" ")
+        if pid.isascii() and pid.isdigit() and len(pid) <= _MAX_DIGITS:
+            found[int(pid)] = short_line(text, MAX_REASON)
+    return found

@@ -8,9 +8,9 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dora_systemd.decisions.cell.counters import WHOLE_CELL
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.releases.past import Switch
+from dora_systemd.decisions.resources.usage import WHOLE_CELL
 from dora_systemd.decisions.views.facts import NODE_FACTS, Fact, NodeRow
 from dora_systemd.decisions.views.rows import DATAFLOW_FACTS, DataflowRow
 from dora_systemd.errors import DoraSystemdError

@@ -6,9 +6,8 @@ https://prometheus.io/docs/instrumenting/exposition_formats and .../docs/practic
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from dora_systemd.decisions.cell.counters import WHOLE_CELL
 from dora_systemd.decisions.cell.status import NODE_STATES
-from dora_systemd.decisions.resources.usage import Strain, Usage, limit_of
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, Strain, Usage, limit_of
 from dora_systemd.decisions.views.dataflows import FAILED, STOPPED, UP_WORDS
 from dora_systemd.decisions.views.facts import (
     NODE_FACTS,

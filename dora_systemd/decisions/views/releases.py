@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.releases.choice import UNPROVED
 from dora_systemd.decisions.releases.manifest import Manifest
-from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, Switch
+from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, UNPROVED, Switch
 from dora_systemd.decisions.releases.progress import COPY, SOAK, Step
 from dora_systemd.decisions.releases.versions import PROGRAMS
 from dora_systemd.decisions.views.dataflows import format_table

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dora_systemd.decisions.cell.counters import LineCount
-from dora_systemd.decisions.resources.usage import Strain, Usage
+from dora_systemd.decisions.resources.usage import LineCount, Strain, Usage
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.rows import DataflowRow
 

@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.counters import WHOLE_CELL
 from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES
-from dora_systemd.decisions.resources.usage import format_waits
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, format_waits
 from dora_systemd.decisions.views.dataflows import format_table, node_count
 from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.formats import (

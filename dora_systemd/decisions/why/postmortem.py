@@ -6,18 +6,17 @@ If the cause is not recorded, the verdict says so; it never guesses.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from dora_systemd.decisions.cell.asked import RESTART
 from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
 from dora_systemd.decisions.cell.machines import HEAD
-from dora_systemd.decisions.cell.owed import STARVED
+from dora_systemd.decisions.cell.owes import STARVED
+from dora_systemd.decisions.cell.status import RESTART
 from dora_systemd.decisions.life.causes import ESSENTIAL, NO_END, UNIT_RESULTS, Cause, result_words
-from dora_systemd.decisions.life.setup_exits import setup_failure
+from dora_systemd.decisions.life.refusal import setup_failure
 from dora_systemd.decisions.logs.events import NODE_END_EVENTS
-from dora_systemd.decisions.reload.steps import How
-from dora_systemd.decisions.signs.judge import by_watchdog
+from dora_systemd.decisions.reload.changes import How
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
-from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
-from dora_systemd.decisions.why.nodes import ended_nodes
+from dora_systemd.decisions.watchdog.judge import by_watchdog
+from dora_systemd.decisions.why.lives import Happening, Life, ended_nodes, with_restarts
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 from dora_systemd.values import SECOND
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from dora_systemd.adapters.dora.control import Connection
 from dora_systemd.adapters.runner_socket.client import relay
-from dora_systemd.decisions.cell.asked import RESTART, STOP
 from dora_systemd.decisions.cell.launch import PROGRAM_KEYS
+from dora_systemd.decisions.cell.status import RESTART, STOP
 from dora_systemd.decisions.dora.protocol import Params, Reply
 from dora_systemd.decisions.gateway.answers import restored_descriptor
 from dora_systemd.decisions.gateway.frames import Request, renamed

@@ -17,7 +17,13 @@ from dora_systemd.decisions.gateway.answers import is_from_systemd, is_wanted, l
 from dora_systemd.decisions.gateway.frames import LOGS_LIMIT, Request, format_event, logs_parts
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import end_matches, journal_timestamp, scope_matches
-from dora_systemd.decisions.logs.records import LOG_FIELDS, Record, log_payload, record_text
+from dora_systemd.decisions.logs.records import (
+    LOG_FIELDS,
+    Record,
+    lines_elsewhere,
+    log_payload,
+    record_text,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.session import Place, Result, Talk, find_if_loaded
 from dora_systemd.gateway.control.state import find_name
@@ -79,8 +85,6 @@ def _elsewhere(scope: Scope, uuid: str, node: str, now: int) -> list[Record]:
     if cell is None or cell.options.machine or not cell.options.placed:
         return []
     # Imported late: most dataflows run on one machine.
-    from dora_systemd.decisions.machines.elsewhere import lines_elsewhere
-
     return lines_elsewhere(cell.name, cell.options.placed, node, now)
 
 

@@ -18,9 +18,8 @@ from typing import Any
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.host.files import decoded, parse_yaml
-from dora_systemd.decisions.descriptor.build_session import session_path
-from dora_systemd.decisions.gateway.flags import sent_flags
-from dora_systemd.decisions.gateway.frames import Request
+from dora_systemd.decisions.descriptor.dataflow import session_path
+from dora_systemd.decisions.gateway.frames import Request, sent_flags
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.session import Result, Talk
 from dora_systemd.gateway.control.state import spawned

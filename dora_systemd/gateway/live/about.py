@@ -5,13 +5,16 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
-from dora_systemd.decisions.gateway.page_facts import PROPERTIES, fact_values
-from dora_systemd.decisions.gateway.page_messages import MAX_ITEMS, shown_values
+from dora_systemd.decisions.gateway.page_messages import (
+    MAX_ITEMS,
+    PROPERTIES,
+    fact_values,
+    shown_values,
+)
 from dora_systemd.decisions.views.dataflows import is_up_word
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.rows import DataflowRow
-from dora_systemd.decisions.why.report import Report
-from dora_systemd.decisions.why.report_object import report_object
+from dora_systemd.decisions.why.report import Report, report_object
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cell, read_cells

@@ -16,6 +16,7 @@ from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage, line_values
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import LogQuery, query_arguments
+from dora_systemd.decisions.logs.records import lines_elsewhere
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.recorded import find_query
@@ -65,8 +66,6 @@ def _notes(cell: Cell, node: str) -> Lines:
     if options.machine or not options.placed:
         return []
     # Imported late: most dataflows run on one machine.
-    from dora_systemd.decisions.machines.elsewhere import lines_elsewhere
-
     records = lines_elsewhere(cell.name, options.placed, node, time.time_ns() // 1000)
     return list(map(line_values, records))
 

@@ -12,14 +12,14 @@ from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owed import is_probe
+from dora_systemd.decisions.cell.owes import is_probe
+from dora_systemd.decisions.cell.rights import is_essential
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.nodes import held, lacking, with_process
+from dora_systemd.decisions.life.node_table import held, lacking, with_process
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
-from dora_systemd.decisions.rights.node_rights import is_essential
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.clock import Gaps
 from dora_systemd.runner.cell.engine import Engine

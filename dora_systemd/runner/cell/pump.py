@@ -21,7 +21,6 @@ from pathlib import Path
 
 from dora_systemd.adapters.host import fd_store, files, notify
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.decisions.cell.counters import CpuSample, add_sample
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
@@ -30,6 +29,7 @@ from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Recor
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status, is_up
 from dora_systemd.decisions.logs.events import END_EVENTS, NODE_END_EVENTS
+from dora_systemd.decisions.resources.usage import CpuSample, add_sample
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.failure import failed, say

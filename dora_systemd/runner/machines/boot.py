@@ -24,7 +24,7 @@ from dora_systemd.adapters.runner_socket.door import Door
 from dora_systemd.decisions.cell.machines import HEAD, members_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.machines.address import LOOPBACK, endpoint
-from dora_systemd.decisions.machines.own import own_options
+from dora_systemd.decisions.machines.part import own_options
 from dora_systemd.decisions.machines.wire import (
     MAX_LINE,
     PORT_RANGE,

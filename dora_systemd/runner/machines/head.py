@@ -21,25 +21,25 @@ from dora_systemd.adapters.runner_socket.door import Door
 from dora_systemd.adapters.runner_socket.listener import Session, refuse
 from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.machines import members_of, placed_on
+from dora_systemd.decisions.cell.machines import format_missing, members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.rights import is_essential
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.nodes import with_process
+from dora_systemd.decisions.life.node_table import with_process
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.machines.awaited import format_missing
-from dora_systemd.decisions.machines.own import is_here
-from dora_systemd.decisions.machines.part import check_placed, with_works
-from dora_systemd.decisions.machines.programs import (
+from dora_systemd.decisions.machines.part import (
+    check_placed,
     differing,
     format_differing,
+    is_here,
     parse_digests,
+    with_works,
 )
-from dora_systemd.decisions.rights.node_rights import is_essential
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon

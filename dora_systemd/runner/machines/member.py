@@ -20,23 +20,22 @@ from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host import files
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.splice import Ends, taken_over
-from dora_systemd.decisions.cell.asked import RESTART, STOP
-from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.cell.rights import without_essential
+from dora_systemd.decisions.cell.status import RESTART, STOP, CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import (
     COPY_HINT,
     check_placed,
+    format_digests,
     format_other_file,
     launch_files,
 )
-from dora_systemd.decisions.machines.programs import format_digests
 from dora_systemd.decisions.machines.usage import told_use
-from dora_systemd.decisions.rights.node_rights import without_essential
+from dora_systemd.decisions.resources.usage import CpuSample
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon

@@ -12,7 +12,7 @@ from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.machines.own import is_here
+from dora_systemd.decisions.machines.part import is_here
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.pump import Pump, now_us

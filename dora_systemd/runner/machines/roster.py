@@ -12,14 +12,19 @@ from dora_systemd import __version__
 from dora_systemd.adapters.runner_socket.client import Request
 from dora_systemd.adapters.runner_socket.listener import refuse
 from dora_systemd.adapters.runner_socket.splice import Ends
-from dora_systemd.decisions.cell.machines import members_of, placed_on
+from dora_systemd.decisions.cell.machines import (
+    NOT_CONNECTED,
+    NOT_JOINED,
+    USUAL,
+    members_of,
+    placed_on,
+)
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.address import endpoint
-from dora_systemd.decisions.machines.awaited import NOT_CONNECTED, NOT_JOINED, USUAL
 from dora_systemd.decisions.machines.usage import merged
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.runner.cell.pump import now_us

@@ -14,9 +14,7 @@ from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import protocol
-from dora_systemd.decisions.machines.own import is_here, own_options
-from dora_systemd.decisions.machines.part import own_dataflow
-from dora_systemd.decisions.machines.programs import MOST_FILES
+from dora_systemd.decisions.machines.part import MOST_FILES, is_here, own_dataflow, own_options
 from dora_systemd.decisions.machines.wire import Forwards, Part
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths

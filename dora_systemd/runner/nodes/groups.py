@@ -8,12 +8,12 @@ from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_load, read_oom
-from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample, throttled_percent
 from dora_systemd.decisions.cell.log_backlog import Marks
-from dora_systemd.decisions.cell.owed import PROBE
+from dora_systemd.decisions.cell.owes import PROBE
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_owner, largest
 from dora_systemd.decisions.resources.pressure import Alarms, Load, look
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, throttled_percent
 
 
 class Resources:

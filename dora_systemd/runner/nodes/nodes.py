@@ -15,22 +15,22 @@ from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.host.rights import lower_rights
 from dora_systemd.adapters.logs.jsonl import JsonlTail
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample
 from dora_systemd.decisions.cell.launch import has_launcher, has_pipes, is_launched
 from dora_systemd.decisions.cell.limits import NodeLimits, without_cpus
 from dora_systemd.decisions.cell.line_rates import RateLimits, rate_of
 from dora_systemd.decisions.cell.log_backlog import marks_of
+from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.resources.oom import Oom
-from dora_systemd.decisions.rights.node_rights import NodeRights
-from dora_systemd.decisions.signs.watchdogs import NO_WATCHDOGS, Watchdogs
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample
+from dora_systemd.decisions.watchdog.watchdogs import NO_WATCHDOGS, Watchdogs
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes.groups import Hold, Resources
 from dora_systemd.runner.nodes.launcher_gates import Gates
 
 if TYPE_CHECKING:
-    from dora_systemd.decisions.signs.table import Sign
+    from dora_systemd.decisions.watchdog.messages import Sign
     from dora_systemd.runner.nodes.watchdog import NotifySockets
 
 _GONE_SECONDS = 0.05

@@ -9,9 +9,8 @@ from dora_systemd.adapters.dora.preparation import check_named_nodes
 from dora_systemd.adapters.host.rights import check_cpus, prove_rights, read_base
 from dora_systemd.decisions.cell.limits import CPUS, has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.rights import NodeRights, format_commands, rights_commands
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.rights.commands import format_commands, rights_commands
-from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.values import format_cpus
 
 _OF_UNITS = re.compile(r"/(dora-|doractl-check-)[^/]+\.service(/|$)")

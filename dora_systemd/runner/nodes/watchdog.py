@@ -20,7 +20,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State
-from dora_systemd.decisions.signs.judge import (
+from dora_systemd.decisions.watchdog.judge import (
     TRIGGERED,
     Act,
     Clock,
@@ -30,9 +30,8 @@ from dora_systemd.decisions.signs.judge import (
     missed,
     period_of,
 )
-from dora_systemd.decisions.signs.messages import Message, parse_message
-from dora_systemd.decisions.signs.table import Sign
-from dora_systemd.decisions.signs.watchdogs import Watchdogs, watchdog_of
+from dora_systemd.decisions.watchdog.messages import Message, Sign, parse_message
+from dora_systemd.decisions.watchdog.watchdogs import Watchdogs, watchdog_of
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import INFINITY, SECOND
 

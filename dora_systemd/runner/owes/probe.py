@@ -6,12 +6,11 @@ from typing import Any
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.preparation import PACKAGE
 from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
-from dora_systemd.decisions.cell.owed import PROBE
+from dora_systemd.decisions.cell.owes import PROBE
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life.states import State
-from dora_systemd.decisions.owes.feeds import Feeds
-from dora_systemd.decisions.owes.probe import probe_definition
+from dora_systemd.decisions.owes.probe import Feeds, probe_definition
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.reload.apply import Run

@@ -11,15 +11,14 @@ from functools import partial
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.dora.probe import probe_python
 from dora_systemd.adapters.host.shared_times import SharedTimes
-from dora_systemd.decisions.cell.owed import RESTART, WARN
+from dora_systemd.decisions.cell.owes import RESTART, WARN
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
-from dora_systemd.decisions.owes.feeds import find_feeds
 from dora_systemd.decisions.owes.judge import Judge, Look, Verdict, look
-from dora_systemd.decisions.owes.probe import parse_times, size_of_times
+from dora_systemd.decisions.owes.probe import find_feeds, parse_times, size_of_times
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks

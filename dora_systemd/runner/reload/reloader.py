@@ -18,9 +18,9 @@ from dora_systemd.adapters.host.watch import Since, identity
 from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.descriptor.wiring import downstream_of
+from dora_systemd.decisions.cell.rights import essential_nodes
+from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.rights.node_rights import essential_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.runner.cell.failure import words

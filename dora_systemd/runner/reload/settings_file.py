@@ -66,7 +66,7 @@ class SettingsFile:
 
 def main(before: str, after: str, name: str) -> int:
     """Print the differences as JSON. name: the path of the file, for errors."""
-    from dora_systemd.decisions.settings.changes import settings_change
+    from dora_systemd.decisions.settings.differences import settings_change
     from dora_systemd.decisions.settings.resolve import resolve_settings
 
     try:

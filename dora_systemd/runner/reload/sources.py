@@ -15,9 +15,16 @@ from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.launch import kinds, launch_descriptor, sources
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.nodes import NodeKind
-from dora_systemd.decisions.reload.changes import Difference, NodeSources, difference, touched
+from dora_systemd.decisions.reload.changes import (
+    Difference,
+    How,
+    NodeSources,
+    Step,
+    difference,
+    plan_steps,
+    touched,
+)
 from dora_systemd.decisions.reload.imports import program_files, syntax_error
-from dora_systemd.decisions.reload.steps import How, Step, plan_steps
 from dora_systemd.decisions.reload.watch_rules import WatchRules
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import let_openssl_in

@@ -25,8 +25,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dora_systemd.decisions.cell.asked import RESTART
-from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.cell.status import RESTART, NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import written_us
-from dora_systemd.decisions.needs.awaited import format_awaited
-from dora_systemd.decisions.needs.words import START, format_wait
+from dora_systemd.decisions.needs.units import format_awaited
+from dora_systemd.decisions.needs.waiting import START, format_wait
 from dora_systemd.decisions.views.dataflows import STARTING, WAITING
 from dora_systemd.verbs.facts.cells import Cell
 

@@ -5,12 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.counters import (
-    WHOLE_CELL,
-    CpuSample,
-    cpu_percent,
-    throttled_percent,
-)
 from dora_systemd.decisions.cell.limits import CPUS, has_cpus
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.cell.status import (
@@ -18,7 +12,14 @@ from dora_systemd.decisions.cell.status import (
     GATHERING,
     CellStatus,
 )
-from dora_systemd.decisions.resources.usage import Usage, usage_facts
+from dora_systemd.decisions.resources.usage import (
+    WHOLE_CELL,
+    CpuSample,
+    Usage,
+    cpu_percent,
+    throttled_percent,
+    usage_facts,
+)
 from dora_systemd.decisions.views.facts import OutputRow, node_row
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.scope import Scope
@@ -36,7 +37,7 @@ from dora_systemd.verbs.facts.reading import (
 )
 
 if TYPE_CHECKING:
-    from dora_systemd.decisions.rights.node_rights import NodeRights
+    from dora_systemd.decisions.cell.rights import NodeRights
 
 
 def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
@@ -200,7 +201,7 @@ def _signs(status: CellStatus, node: str, now_us: int) -> dict[str, Any]:
     """What a node says of itself, as rows have it."""
     if node not in status.signs:
         return {}
-    from dora_systemd.decisions.signs.table import parse_sign, sign_facts
+    from dora_systemd.decisions.watchdog.messages import parse_sign, sign_facts
 
     return sign_facts(parse_sign(status.signs[node]), now_us)
 

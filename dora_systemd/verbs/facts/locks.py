@@ -12,8 +12,7 @@ from enum import Enum
 from pathlib import Path
 
 from dora_systemd.adapters.host.process_table import LockProcess, read_flocks, read_lock_process
-from dora_systemd.decisions.cell.inhibit import parse_reasons
-from dora_systemd.decisions.views.inhibitors import format_holders
+from dora_systemd.decisions.views.inhibitors import format_holders, parse_reasons
 from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import Named, unit_name

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.resources.usage import Usage
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, Usage
 from dora_systemd.decisions.views.dataflows import FROZEN
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE
@@ -21,7 +20,7 @@ from dora_systemd.trust.files import read_table, read_times
 from dora_systemd.verbs.facts.cells import Cell
 
 if TYPE_CHECKING:  # the table of `list` does without
-    from dora_systemd.decisions.cell.owed import Owed
+    from dora_systemd.decisions.cell.owes import Owed
     from dora_systemd.decisions.machines.usage import NodeUse
     from dora_systemd.verbs.facts.held import Held
 
@@ -131,8 +130,7 @@ def read_heard(scope: Scope, name: str, owes: "Sequence[Owed]") -> tuple[int, ..
     """The last message of each owed output of a dataflow, CLOCK_MONOTONIC µs, 0 is never."""
     if not owes:
         return ()
-    from dora_systemd.decisions.owes.feeds import MOST_FEEDS
-    from dora_systemd.decisions.owes.probe import parse_times, size_of_times
+    from dora_systemd.decisions.owes.probe import MOST_FEEDS, parse_times, size_of_times
 
     data = read_times(scope.cell_directory(name), size_of_times(len(owes) + MOST_FEEDS))
     return parse_times(data, len(owes), _monotonic_us())[1]

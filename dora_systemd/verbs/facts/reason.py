@@ -8,8 +8,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.life.causes import result_words
-from dora_systemd.decisions.life.refusal import parse_refusal, without_hint
-from dora_systemd.decisions.life.setup_exits import setup_failure
+from dora_systemd.decisions.life.refusal import parse_refusal, setup_failure, without_hint
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import name_from_unit
 

@@ -12,12 +12,11 @@ from dora_systemd.adapters.host.addresses import port_error
 from dora_systemd.adapters.host.process import read_child
 from dora_systemd.adapters.ssh import start_ssh
 from dora_systemd.decisions.cell.machines import HEAD
-from dora_systemd.decisions.machines.facts import Facts, parse_facts
+from dora_systemd.decisions.machines.description import Facts, parse_facts
 from dora_systemd.decisions.machines.link_command import LinkOptions, ssh_link_arguments
 from dora_systemd.decisions.machines.wire import PORT_RANGE, Forwards
-from dora_systemd.decisions.remote.command import Way, quote, remote_command, ssh_arguments
-from dora_systemd.decisions.remote.failures import ending_error, failed_there, lost, silent
-from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.hosts import Host, Way, quote, remote_command, ssh_arguments
+from dora_systemd.decisions.remote.ssh_failures import ending_error, failed_there, lost, silent
 from dora_systemd.decisions.remote.stream import AfterMark
 from dora_systemd.errors import TimedOut
 

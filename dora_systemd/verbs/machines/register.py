@@ -10,9 +10,8 @@ from stat import S_IMODE
 from dora_systemd.adapters.host.files import decoded, parse_yaml, write_atomic
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.decisions.cell.machines import parse_machine
-from dora_systemd.decisions.machines.declared import with_machine, without_machine
-from dora_systemd.decisions.machines.entry import parse_entry
-from dora_systemd.decisions.machines.facts import problems, required
+from dora_systemd.decisions.machines.description import problems, required
+from dora_systemd.decisions.machines.entry import parse_entry, with_machine, without_machine
 from dora_systemd.decisions.machines.key import authorized_line, key_text
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.machines import MACHINES

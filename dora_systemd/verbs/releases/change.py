@@ -22,7 +22,7 @@ from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.progress import Step, going_back, judged, stopping, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
-from dora_systemd.decisions.why.signs import known_remedy
+from dora_systemd.decisions.why.remedies import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope

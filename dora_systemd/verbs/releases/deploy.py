@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked, unusable
-from dora_systemd.decisions.releases.choice import surplus
 from dora_systemd.decisions.releases.entries import FILE, LINK, Found, Stored, of_project, touched
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.past import surplus
 from dora_systemd.decisions.releases.progress import checking, waiting
-from dora_systemd.decisions.settings.lost import lost_options
+from dora_systemd.decisions.settings.differences import lost_options
 from dora_systemd.decisions.settings.resolve import given_texts
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of, user_of, with_boot_check
 from dora_systemd.decisions.unit.properties import format_unit

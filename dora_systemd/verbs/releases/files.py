@@ -21,8 +21,7 @@ from dora_systemd.decisions.releases.entries import (
     refusal,
     too_many,
 )
-from dora_systemd.decisions.releases.ids import is_revision
-from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.manifest import Manifest, is_revision
 from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT
 from dora_systemd.trust.project import Project
 

@@ -7,9 +7,17 @@ from pathlib import Path
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, is_locked, store_root
 from dora_systemd.adapters.releases.transfer import leftovers
-from dora_systemd.decisions.releases.choice import UNKNOWN, UNPROVED, Known, state_of
 from dora_systemd.decisions.releases.manifest import Manifest
-from dora_systemd.decisions.releases.past import Switch, begins, ends, marks
+from dora_systemd.decisions.releases.past import (
+    UNKNOWN,
+    UNPROVED,
+    Known,
+    Switch,
+    begins,
+    ends,
+    marks,
+    state_of,
+)
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.decisions.views.releases import ReleaseRow
 from dora_systemd.errors import DoraSystemdError

@@ -13,7 +13,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager, queued_job
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.progress import Step, soaking, starting, stopping
 from dora_systemd.decisions.why.faults import FAULT_IDS, WAITING, Fault, find_fault, is_finished

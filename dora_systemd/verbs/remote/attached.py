@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterator, Sequence
 
 from dora_systemd.decisions.logs.query import journal_timestamp
 from dora_systemd.decisions.logs.records import Record, record_text
-from dora_systemd.decisions.remote.command import Way
-from dora_systemd.decisions.remote.failures import too_much
-from dora_systemd.decisions.remote.hosts import Host
-from dora_systemd.decisions.remote.records import TIME, Records
+from dora_systemd.decisions.remote.hosts import Host, Way
+from dora_systemd.decisions.remote.merge import TIME, Records
+from dora_systemd.decisions.remote.ssh_failures import too_much
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.logs import FollowedLog
 from dora_systemd.verbs.remote.talk import Ended, Said, Talk

@@ -13,9 +13,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from dora_systemd.adapters.ssh import Connection
-from dora_systemd.decisions.remote.command import Way, remote_command, ssh_arguments
-from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, mute, silent
-from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.hosts import Host, Way, remote_command, ssh_arguments
+from dora_systemd.decisions.remote.ssh_failures import ending_error, is_of_ssh, mute, silent
 from dora_systemd.decisions.remote.stream import AfterMark
 from dora_systemd.errors import DoraSystemdError
 

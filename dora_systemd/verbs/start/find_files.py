@@ -16,12 +16,12 @@ from typing import Any
 from dora_systemd.adapters.dora.command import find_dora
 from dora_systemd.adapters.host.files import absolute_path, decoded, parse_yaml
 from dora_systemd.decisions.cell.launch import LaunchPlan
-from dora_systemd.decisions.descriptor.build_session import (
+from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
+    Dataflow,
     parse_session,
     session_path,
 )
-from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import NodeKind
 from dora_systemd.decisions.settings.credentials import CREDENTIALS, MAX_SIZE
 from dora_systemd.decisions.settings.kinds import Setting

@@ -10,10 +10,14 @@ from typing import NamedTuple
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NETWORK, NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.needs.awaited import format_awaited
-from dora_systemd.decisions.needs.devices import lone_devices
-from dora_systemd.decisions.needs.units import CLOCK_WAITERS, needed_mounts, required_units
-from dora_systemd.decisions.needs.words import START, WAITS, format_wait
+from dora_systemd.decisions.needs.units import (
+    CLOCK_WAITERS,
+    format_awaited,
+    lone_devices,
+    needed_mounts,
+    required_units,
+)
+from dora_systemd.decisions.needs.waiting import START, WAITS, format_wait
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit, unit_name
 from dora_systemd.values import shown

@@ -23,8 +23,7 @@ from dora_systemd.decisions.descriptor.expansion import called_variables
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.sandbox import Sandbox
 from dora_systemd.decisions.settings.machines import MACHINES
-from dora_systemd.decisions.settings.resolve import Settings
-from dora_systemd.decisions.settings.runner_options import with_settings
+from dora_systemd.decisions.settings.resolve import Settings, with_settings
 from dora_systemd.decisions.settings.table import ENV, ENV_FILE, USER, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_path, parse_name, release_of, unit_name

@@ -11,10 +11,10 @@ from dora_systemd.adapters.host.files import absolute_path
 from dora_systemd.decisions.cell.launch import python_of
 from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.rights import has_process_rights
 from dora_systemd.decisions.cell.uv import uv_project
-from dora_systemd.decisions.needs.devices import device_entries
+from dora_systemd.decisions.needs.units import device_entries
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
-from dora_systemd.decisions.rights.node_rights import has_process_rights
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.sandbox import NETWORK, SANDBOX, WRITABLE

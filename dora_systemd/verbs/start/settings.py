@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, find_line, parse_yaml
-from dora_systemd.decisions.rights.node_rights import BY_KEY
+from dora_systemd.decisions.cell.rights import BY_KEY
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS

@@ -12,7 +12,7 @@ from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, unmatched_patterns
 from dora_systemd.decisions.settings.limits import DEVICE
 from dora_systemd.decisions.settings.needs import NEEDS
-from dora_systemd.decisions.settings.runner_options import idle_warnings
+from dora_systemd.decisions.settings.resolve import idle_warnings
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported

@@ -1,11 +1,11 @@
-"""What happens to nodes whose needs are missing: every state, before and after the start."""
+"""What happens to nodes whose needs are missing, devices of the sandbox, what a start waits for."""
 
 import pytest
 
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NODE_STATES, NodeStatus
-from dora_systemd.decisions.needs.devices import device_entries, lone_devices
 from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
+from dora_systemd.decisions.needs.units import device_entries, format_awaited, lone_devices
 
 GONE = "/dev/video0 (not there)"
 OPEN = frozenset({"camera"})
@@ -75,3 +75,24 @@ def test_the_sandbox_opens_the_group_of_a_device() -> None:
 def test_a_device_without_a_group_is_told() -> None:
     sandboxed = [NodeNeed("arm", f"/dev/{one}") for one in ("odd", "video0", "null", "shm/map")]
     assert lone_devices(sandboxed) == (NodeNeed("arm", "/dev/odd"),)
+
+
+@pytest.mark.parametrize(
+    ("units", "text"),
+    [
+        ((), ""),
+        (("network-online.target",), "network"),
+        (("time-sync.target", "chrony-wait.service"), "clock"),
+        (("dora-base.service", "basic.target", "dora.slice"), "dataflow base"),
+        (("basic.target", "dora.slice"), "basic.target, dora.slice"),
+        (("data-my\\x2dmaps.mount",), "mount /data/my-maps"),
+        (("-.mount",), "mount /"),
+        (("\\x2ehidden.mount",), "mount /.hidden"),
+        (
+            ("e.service", "d.service", "c.service", "b.service"),
+            "b.service, c.service, d.service and 1 more",
+        ),
+    ],
+)
+def test_what_a_start_waits_for(units: tuple[str, ...], text: str) -> None:
+    assert format_awaited(units) == text

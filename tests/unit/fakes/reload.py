@@ -10,7 +10,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
-from dora_systemd.decisions.reload.steps import How, Step
+from dora_systemd.decisions.reload.changes import How, Step
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.cell.restarts import Life

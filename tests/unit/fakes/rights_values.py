@@ -4,7 +4,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.rights.node_rights import NodeRights
+from dora_systemd.decisions.cell.rights import NodeRights
 from tests.unit.fakes.limit_values import IDS
 
 REALTIME = st.builds("{}:{}".format, st.sampled_from(["rr", "fifo"]), st.integers(1, 99))

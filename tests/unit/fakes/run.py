@@ -10,16 +10,16 @@ from typing import Any
 from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.logs.source import OnLine
-from dora_systemd.decisions.cell.counters import CpuSample, LineCount
 from dora_systemd.decisions.cell.limits import NodeLimits
 from dora_systemd.decisions.cell.line_rates import RateLimits
+from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.dora.protocol import LogRecord, Params, Reply
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.logs.fields import Value
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.decisions.resources.oom import Oom
-from dora_systemd.decisions.rights.node_rights import NodeRights
+from dora_systemd.decisions.resources.usage import CpuSample, LineCount
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.engine import Engine

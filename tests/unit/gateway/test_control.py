@@ -24,7 +24,6 @@ from dora_systemd.decisions.gateway.answers import (
     restored_descriptor,
     stopped,
 )
-from dora_systemd.decisions.gateway.flags import sent_flags
 from dora_systemd.decisions.gateway.frames import (
     Malformed,
     Request,
@@ -33,6 +32,7 @@ from dora_systemd.decisions.gateway.frames import (
     parse_request,
     refused_version,
     renamed,
+    sent_flags,
 )
 from dora_systemd.decisions.gateway.request import Request as HttpRequest
 from dora_systemd.decisions.logs.records import log_payload

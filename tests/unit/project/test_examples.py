@@ -15,7 +15,7 @@ import pytest
 
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.cli.remote.dispatch import valued_options
-from dora_systemd.decisions.remote.words import part_hosts
+from dora_systemd.decisions.remote.command_line import part_hosts
 from dora_systemd.errors import DoraSystemdError
 from tests.system.typed import typed_lines
 from tests.unit.checkout import CHECKOUT

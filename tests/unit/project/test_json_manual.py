@@ -25,8 +25,7 @@ from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.top import Look, TopEntry, look_values
 from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import Happening
-from dora_systemd.decisions.why.report import Report, Subject
-from dora_systemd.decisions.why.report_object import report_object
+from dora_systemd.decisions.why.report import Report, Subject, report_object
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import SECOND

@@ -29,7 +29,7 @@ LATE = {
         "cli.edge": {"decisions.views.objects"},
     },
     "shutil imports every compressor: only a terminal has a width; a pipe hears of machines": {
-        "cli.terminal": {"shutil", "decisions.machines.awaited"},
+        "cli.terminal": {"shutil", "decisions.cell.machines"},
     },
     "a start that succeeds has no last words, most follow no log and copy no files": {
         "cli.verbs.run.start": {
@@ -70,7 +70,7 @@ LATE = {
     },
     "the runner knows the class, and the settings are read by a child": {
         "runner.reload.settings_file": {
-            *("decisions.settings.changes", "decisions.settings.resolve"),
+            *("decisions.settings.differences", "decisions.settings.resolve"),
         },
     },
     "YAML, and every compressor: most who read a file need neither": {
@@ -92,7 +92,7 @@ LATE = {
             "runner.owes.watch",
         },
         "verbs.facts.reading": {
-            *("decisions.machines.usage", "decisions.owes.feeds", "decisions.owes.probe"),
+            *("decisions.machines.usage", "decisions.owes.probe"),
             *("verbs.facts.held", "verbs.facts.budget"),
         },
     },
@@ -100,8 +100,6 @@ LATE = {
         "runner.owes.listen": {"dora"},
     },
     "most dataflows run on one machine and have no releases, and most links are not lost": {
-        "gateway.control.logs": {"decisions.machines.elsewhere"},
-        "gateway.live.lines": {"decisions.machines.elsewhere"},
         "cli.foreground": {"verbs.facts.machines", "verbs.remote.attached"},
         "verbs.start.plan": {
             *("adapters.host.addresses", "adapters.host.watch"),
@@ -124,13 +122,13 @@ LATE = {
     },
     "a list without dataflows has no node": {
         "decisions.views.facts": {
-            *("decisions.cell.asked", "decisions.cell.machines", "decisions.cell.status"),
+            *("decisions.cell.machines", "decisions.cell.status"),
         },
     },
     "most dataflows have no notify sockets": {
         "runner.nodes.nodes": {"runner.nodes.watchdog"},
         "runner.cell.dialogue": {"runner.nodes.watchdog"},
-        "verbs.facts.list": {"decisions.signs.table"},
+        "verbs.facts.list": {"decisions.watchdog.messages"},
     },
     "asyncio and WebSockets: of all verbs, a few need one of them": {
         "verbs.node": {"adapters.dora.control", "adapters.runner_socket.relay"},

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.host.real_time import read_real_time
-from dora_systemd.decisions.views.real_time import RealTime
+from dora_systemd.decisions.views.findings import RealTime
 from tests.unit.fakes.programs import make_program
 
 CPUS = "sys/devices/system/cpu"

@@ -16,8 +16,7 @@ from dora_systemd.adapters.host.rights import (
     read_base,
 )
 from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.rights.commands import BEHIND_ESSENTIAL
-from dora_systemd.decisions.rights.node_rights import NodeRights, parse_node_rights
+from dora_systemd.decisions.cell.rights import BEHIND_ESSENTIAL, NodeRights, parse_node_rights
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 

@@ -13,9 +13,9 @@ from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.held import read_held
 from dora_systemd.adapters.logs.pipes import DRAIN_LIMIT, LogPipes
 from dora_systemd.adapters.logs.source import PIPE_SIZE, fifos
-from dora_systemd.decisions.cell.counters import WHOLE_CELL, LineCount
 from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, LineCount
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import SECOND
 

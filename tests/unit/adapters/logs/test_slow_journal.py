@@ -6,9 +6,9 @@ from pathlib import Path
 
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.logs.queue import MAX_RECORDS
-from dora_systemd.decisions.cell.counters import WHOLE_CELL, LineCount
 from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.decisions.resources.usage import WHOLE_CELL, LineCount
 from dora_systemd.values import SECOND
 from tests.unit.adapters.logs.test_queue import SlowJournal
 

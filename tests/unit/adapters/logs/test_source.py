@@ -8,8 +8,7 @@ import pytest
 
 from dora_systemd.adapters.logs.held import HeldLines, read_held
 from dora_systemd.adapters.logs.source import CHUNK, FLOOD_BYTES, Pipe, Source, fifos
-from dora_systemd.decisions.cell.line_rates import RateLimit
-from dora_systemd.decisions.logs.limiter import LineLimiter
+from dora_systemd.decisions.cell.line_rates import LineLimiter, RateLimit
 from dora_systemd.decisions.logs.lines import LineEncoder, Origin
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import SECOND

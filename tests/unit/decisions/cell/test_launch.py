@@ -16,12 +16,12 @@ from dora_systemd.decisions.cell.launch import (
     python_of,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.descriptor.build_session import (
+from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
+    parse_dataflow,
     parse_session,
     session_path,
 )
-from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY
 

@@ -22,8 +22,7 @@ from dora_systemd.decisions.settings.limit_checks import (
     size_warnings,
 )
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
-from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
-from dora_systemd.decisions.settings.runner_options import settings_node_limits
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings, settings_node_limits
 from dora_systemd.decisions.unit.properties import realtime_properties, settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY

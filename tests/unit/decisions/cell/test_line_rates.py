@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from dora_systemd.decisions.cell.line_rates import (
     ALL_NODES,
     SHORTEST,
+    LineLimiter,
     RateLimit,
     check_rates,
     format_rate,
@@ -18,9 +19,7 @@ from dora_systemd.decisions.cell.line_rates import (
     parse_rates,
     rate_of,
 )
-from dora_systemd.decisions.logs.limiter import LineLimiter
-from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
-from dora_systemd.decisions.settings.runner_options import log_rates
+from dora_systemd.decisions.settings.resolve import Settings, log_rates, resolve_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
 

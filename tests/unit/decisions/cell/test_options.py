@@ -19,10 +19,10 @@ from dora_systemd.decisions.cell.options import (
     parse_runner_argv,
     runner_command,
 )
-from dora_systemd.decisions.cell.owed import SHORTEST as SHORTEST_TIME
-from dora_systemd.decisions.cell.owed import THEN, Owed
+from dora_systemd.decisions.cell.owes import SHORTEST as SHORTEST_TIME
+from dora_systemd.decisions.cell.owes import THEN, Owed
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
-from dora_systemd.decisions.rights.node_rights import parse_node_rights
+from dora_systemd.decisions.cell.rights import parse_node_rights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import limits_of_a_node

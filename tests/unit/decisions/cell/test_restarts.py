@@ -15,10 +15,11 @@ from dora_systemd.decisions.cell.restarts import (
     unit_budget,
 )
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
-from dora_systemd.decisions.settings.runner_options import (
+from dora_systemd.decisions.settings.resolve import (
+    Settings,
     idle_warnings,
     node_policies,
+    resolve_settings,
     restart_policy,
 )
 from dora_systemd.decisions.unit.properties import restart_properties

@@ -7,17 +7,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.cell.counters import (
+from dora_systemd.decisions.cell.exits import parse_exit
+from dora_systemd.decisions.cell.status import (
+    NODE_STATES,
+    STAGES,
+    CellStatus,
+    NodeStatus,
+    format_stopped,
+    is_stopped,
+    was_asked,
+)
+from dora_systemd.decisions.resources.usage import (
     CpuSample,
     LineCount,
     add_sample,
     cpu_percent,
     throttled_percent,
 )
-from dora_systemd.decisions.cell.exits import parse_exit
-from dora_systemd.decisions.cell.status import NODE_STATES, STAGES, CellStatus, NodeStatus
-from dora_systemd.decisions.signs.messages import MAX_STATUS
-from dora_systemd.decisions.signs.table import Sign
+from dora_systemd.decisions.watchdog.messages import MAX_STATUS, Sign
 from dora_systemd.errors import DoraSystemdError
 
 counts = st.integers(0, 2**63 - 1)
@@ -190,3 +197,28 @@ def test_cpu_percent(base: tuple[CpuSample, ...], now: CpuSample, percent: float
 def test_a_node_that_came_later_had_used_nothing() -> None:
     base = (CpuSample(0, {"": SECOND}),)
     assert cpu_percent(base, CpuSample(SECOND, {"late": SECOND}), "late") == 100.0
+
+
+ROOT, PAGE = "root (doractl node stop)", "root (status page)"
+
+
+@pytest.mark.parametrize("state", NODE_STATES)
+@pytest.mark.parametrize("asked", ["", "restart", "stop"])
+def test_whether_an_end_was_asked_for(state: str, asked: str) -> None:
+    """Every pair: a stop covers all ends, a restart the one process that it ends."""
+    node = NodeStatus(state, asked=asked)
+    assert was_asked(node) == (asked == "stop" or (asked, state) == ("restart", "reloading"))
+    assert is_stopped(node) == (asked == "stop")
+
+
+@pytest.mark.parametrize(
+    ("stopped", "text"),
+    [
+        ({}, ""),
+        ({"a": ""}, ""),
+        ({"a": ROOT, "b": "", "c": ROOT}, f"a, c, requested by {ROOT}"),
+        ({"a": ROOT, "b": PAGE}, f"a, requested by {ROOT}; b, requested by {PAGE}"),
+    ],
+)
+def test_who_has_stopped_what(stopped: dict[str, str], text: str) -> None:
+    assert format_stopped(stopped) == text

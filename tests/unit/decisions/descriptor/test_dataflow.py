@@ -1,5 +1,6 @@
-"""Descriptors: what is read, what is refused and how, and dora's own errors in one line."""
+"""The descriptor: what dora-systemd reads of it, which nodes depend on which, the words of args."""
 
+import shlex
 import sys
 from typing import Any
 
@@ -7,8 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.descriptor.dataflow import MAX_JSON, Dataflow, parse_dataflow
-from dora_systemd.decisions.descriptor.nodes import Input, NodeKind
+from dora_systemd.decisions.descriptor.dataflow import (
+    MAX_JSON,
+    Dataflow,
+    downstream_of,
+    parse_dataflow,
+)
+from dora_systemd.decisions.descriptor.nodes import Input, NodeKind, split_arguments
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import one_line
@@ -332,3 +338,55 @@ def test_infinite_numbers_in_env_are_texts() -> None:
     read = parse_dataflow({"nodes": [node], "env": env}, "f.yml")
     assert read.env == {"A": "inf", "B": "nan", "C": 0.5}
     assert read.nodes[0].env == read.nodes[0].raw["env"] == {"A": "-inf"}
+
+
+NODES = [
+    {"id": "a", "path": "a", "outputs": ["x"], "inputs": {"t": "dora/timer/millis/1"}},
+    {"id": "b", "path": "b", "inputs": {"x": {"source": "a/x"}}, "outputs": ["y"]},
+    {"id": "c", "path": "c", "inputs": {"y": "b/y", "x": "a/x"}, "outputs": ["z"]},
+    {"id": "d", "path": "d", "inputs": {"z": "c/z"}},
+]
+
+
+def test_chain_and_circle() -> None:
+    found = downstream_of(parse_dataflow({"nodes": NODES}, "f"))
+    assert found == {"a": ("b", "c", "d"), "b": ("c", "d"), "c": ("d",), "d": ()}
+    circle = [{**NODES[0], "inputs": {"z": "c/z"}}, *NODES[1:3]]
+    assert downstream_of(parse_dataflow({"nodes": circle}, "f"))["b"] == ("c", "a")
+
+
+CASES = {
+    "": [],
+    " \t\n": [],
+    "a  b\tc\nd": ["a", "b", "c", "d"],
+    "--name 'a b' \"c d\"": ["--name", "a b", "c d"],
+    "''": [""],
+    "a''b\"c\"": ["abc"],
+    "one \\\ntwo": ["one", "two"],
+    "a\\\nb": ["ab"],
+    "a\\ b \\'": ["a b", "'"],
+    '"a\\$b" "\\`" "\\"" "\\\\"': ["a$b", "`", '"', "\\"],
+    '"a\\nb" "x\\\ny"': ["a\\nb", "xy"],
+    "'a\\b'": ["a\\b"],
+    "#ff0000": [],
+    "--colour #ff0000\n--next": ["--colour", "--next"],
+    "a#b '#c'": ["a#b", "#c"],
+    "a\rb": ["a\rb"],
+    "$HOME `x` *": ["$HOME", "`x`", "*"],
+}
+
+
+@pytest.mark.parametrize("text", CASES)
+def test_as_dora(text: str) -> None:
+    assert split_arguments(text) == CASES[text]
+
+
+@pytest.mark.parametrize("text", ["'a", '"a', 'a "b\\"', "a\\", '"\\'])
+def test_unfinished(text: str) -> None:
+    with pytest.raises(ValueError, match=r"a quote is open|a backslash ends it"):
+        split_arguments(text)
+
+
+@given(st.lists(st.text(st.characters(codec="utf-8"))))
+def test_quoted_words_come_back(words: list[str]) -> None:
+    assert split_arguments(shlex.join(words)) == words

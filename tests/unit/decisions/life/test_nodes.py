@@ -5,7 +5,7 @@ import pytest
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.nodes import NodeTable, has_process, update, with_downstream
+from dora_systemd.decisions.life.node_table import NodeTable, has_process, update, with_downstream
 from dora_systemd.decisions.life.states import Record
 
 RUNNING = {"a": NodeStatus("running", 7, restarts=2, policy=HELD)}

@@ -6,7 +6,7 @@ from typing import get_type_hints
 import pytest
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
-from dora_systemd.decisions.cell.owed import THEN
+from dora_systemd.decisions.cell.owes import THEN
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT

@@ -4,22 +4,21 @@ from dataclasses import replace
 
 import pytest
 
-from dora_systemd.decisions.cell.asked import RESTART, STOP
 from dora_systemd.decisions.cell.exits import Exit, ExitKind, exit_of
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS, LATCH_SECONDS
-from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
+from dora_systemd.decisions.cell.status import HELD, LATCHED, RESTART, STOP, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause, result_words
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
 from dora_systemd.decisions.life.handlers import CASCADE_TIMEOUT
-from dora_systemd.decisions.life.nodes import (
+from dora_systemd.decisions.life.node_table import (
     all_ready,
     apply_results,
     is_over_but_for_held,
     spent,
     update,
 )
-from dora_systemd.decisions.life.setup_exits import setup_failure
+from dora_systemd.decisions.life.refusal import setup_failure
 from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
 from dora_systemd.decisions.life.table import step

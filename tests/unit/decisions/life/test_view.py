@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from dora_systemd.decisions.cell.counters import LineCount
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, stage
-from dora_systemd.decisions.signs.table import Sign
+from dora_systemd.decisions.resources.usage import LineCount
+from dora_systemd.decisions.watchdog.messages import Sign
 
 
 def cell(state: State, **states: str) -> Cell:

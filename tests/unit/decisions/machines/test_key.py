@@ -1,7 +1,7 @@
 import pytest
 
-from dora_systemd.decisions.machines.declared import with_machine, without_machine
-from dora_systemd.decisions.machines.facts import Facts, parse_facts, problems, required
+from dora_systemd.decisions.machines.description import Facts, parse_facts, problems, required
+from dora_systemd.decisions.machines.entry import with_machine, without_machine
 from dora_systemd.decisions.machines.key import authorized_line, forced_words
 from dora_systemd.decisions.machines.link_command import LinkOptions, ssh_link_arguments
 from dora_systemd.decisions.machines.wire import Forwards

@@ -1,5 +1,6 @@
 """The part of a dataflow that one machine runs."""
 
+import json
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,18 @@ from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
-from dora_systemd.decisions.machines.own import own_options
 from dora_systemd.decisions.machines.part import (
     check_placed,
+    differing,
+    format_differing,
+    format_digests,
     launch_files,
     own_dataflow,
+    own_options,
+    parse_digests,
     with_works,
 )
-from dora_systemd.decisions.signs.watchdogs import Watchdogs
+from dora_systemd.decisions.watchdog.watchdogs import Watchdogs
 from dora_systemd.errors import DoraSystemdError
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
@@ -93,3 +98,33 @@ def test_only_what_we_start_ourselves_can_be_elsewhere() -> None:
     check_placed(plan().options, dataflow())
     with pytest.raises(DoraSystemdError, match="node mid cannot run on machine gpu"):
         check_placed(plan().options, dataflow(path="dynamic"))
+
+
+ONE, OTHER = "a" * 64, "b" * 64
+
+
+def test_only_files_that_both_have_can_differ() -> None:
+    told = {"sink.py": ONE, "lib/a.py": ONE, "only/there.bin": ONE}
+    there = parse_digests(format_digests(told))
+    assert there == told
+    assert differing({"sink.py": OTHER, "lib/a.py": ONE, "mine.py": ONE}, there) == ["sink.py"]
+
+
+@pytest.mark.parametrize("path", ["/etc/shadow", "../x.py", "a/../../x.py", "a\0b"])
+def test_no_file_elsewhere_is_read_for_a_member(path: str) -> None:
+    assert parse_digests(json.dumps({path: ONE, "x.py": "short", "y.py": 5})) == {}
+
+
+@pytest.mark.parametrize("text", ["", "[]", "5", "{"])
+def test_another_text(text: str) -> None:
+    with pytest.raises(ValueError):
+        parse_digests(text)
+
+
+def test_what_people_read() -> None:
+    files = ["a.py", "b.py", "c.py", "d.py"]
+    assert format_differing({"gpu": []}) == ""
+    assert format_differing({"gpu": ["a.py"], "arm": files}) == (
+        "machine gpu runs another a.py than the one here; "
+        "machine arm runs another a.py, b.py, c.py and 1 more than the one here"
+    )

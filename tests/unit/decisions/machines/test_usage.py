@@ -5,10 +5,9 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.machines.usage import NodeUse, merged, parse_use, told_use, uses_of
-from dora_systemd.decisions.resources.usage import Usage
+from dora_systemd.decisions.resources.usage import CpuSample, Usage
 from dora_systemd.values import INFINITY, SECOND
 
 USE = Usage(3 * SECOND, 1 << 20, 2 << 20, INFINITY, SECOND // 2, (40, 10))

@@ -4,10 +4,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.decisions.owes.feeds import Feeds, find_feeds
 from dora_systemd.decisions.owes.judge import Judge, Look, Verdict, look
+from dora_systemd.decisions.owes.probe import Feeds, find_feeds
 from dora_systemd.values import SECOND
 
 HOUR, DAY = 3600 * SECOND, 86400 * SECOND

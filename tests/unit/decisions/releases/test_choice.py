@@ -4,11 +4,23 @@ import json
 
 import pytest
 
-from dora_systemd.decisions.releases.choice import Known, before, state_of, surplus
 from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.ids import is_revision, new_id
-from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
-from dora_systemd.decisions.releases.past import REPLACED, ROLLED_BACK, Switch
+from dora_systemd.decisions.releases.manifest import (
+    Manifest,
+    format_manifest,
+    is_revision,
+    new_id,
+    parse_manifest,
+)
+from dora_systemd.decisions.releases.past import (
+    REPLACED,
+    ROLLED_BACK,
+    Known,
+    Switch,
+    before,
+    state_of,
+    surplus,
+)
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_release_id, release_of
 

@@ -6,8 +6,13 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.releases.entries import MOST_FILES, Stored
-from dora_systemd.decisions.releases.ids import is_revision, new_id
-from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
+from dora_systemd.decisions.releases.manifest import (
+    Manifest,
+    format_manifest,
+    is_revision,
+    new_id,
+    parse_manifest,
+)
 from dora_systemd.decisions.releases.parcel import (
     Parcel,
     format_parcel,

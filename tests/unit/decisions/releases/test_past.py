@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.releases.choice import Known, before, state_of, surplus
 from dora_systemd.decisions.releases.past import (
     FAILED,
     INTERRUPTED,
@@ -15,7 +14,9 @@ from dora_systemd.decisions.releases.past import (
     REMOVED,
     REPLACED,
     ROLLED_BACK,
+    Known,
     Switch,
+    before,
     begins,
     completed,
     ends,
@@ -25,6 +26,8 @@ from dora_systemd.decisions.releases.past import (
     marks,
     parse_history,
     runs,
+    state_of,
+    surplus,
     undone,
 )
 

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, last_line, unreached
+from dora_systemd.decisions.remote.host_tables import format_hosts, row_of
 from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.decisions.remote.merge import MOST_HELD, WINDOW_SECONDS, Merge
+from dora_systemd.decisions.remote.ssh_failures import ending_error, is_of_ssh, last_line, unreached
 from dora_systemd.decisions.remote.stream import (
     MAX_LINE,
     AfterMark,
@@ -17,7 +18,6 @@ from dora_systemd.decisions.remote.stream import (
     read_object,
     with_host,
 )
-from dora_systemd.decisions.remote.table import format_hosts, row_of
 from dora_systemd.decisions.views.objects import dataflow_object, format_json
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import ExitCode

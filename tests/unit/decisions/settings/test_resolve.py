@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.line_rates import RateLimit
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
 from dora_systemd.decisions.settings.machines import Declared
@@ -33,7 +33,7 @@ from dora_systemd.decisions.settings.table import (
     VENV,
     WORKING_DIRECTORY,
 )
-from dora_systemd.decisions.signs.watchdogs import SHORTEST
+from dora_systemd.decisions.watchdog.watchdogs import SHORTEST
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import LIMIT_VALUES, RESTART_VALUES

@@ -2,14 +2,16 @@
 
 import pytest
 
-from dora_systemd.decisions.cell.inhibit import format_reason, parse_reason, parse_reasons
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.inhibitors import (
     Inhibited,
     format_holder,
     format_holders,
     format_inhibited,
+    format_reason,
     inhibited_objects,
+    parse_reason,
+    parse_reasons,
 )
 from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode

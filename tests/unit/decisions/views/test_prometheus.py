@@ -13,8 +13,7 @@ from prometheus_client.openmetrics.parser import (
 )
 from prometheus_client.parser import text_string_to_metric_families
 
-from dora_systemd.decisions.cell.counters import LineCount
-from dora_systemd.decisions.resources.usage import Strain, Usage
+from dora_systemd.decisions.resources.usage import LineCount, Strain, Usage
 from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.prometheus import STATES, format_metrics
 from dora_systemd.decisions.views.rows import DataflowRow

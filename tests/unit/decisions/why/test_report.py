@@ -13,8 +13,13 @@ from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, Switch
 from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import Happening
-from dora_systemd.decisions.why.report import Report, Subject, format_report, remedies
-from dora_systemd.decisions.why.report_object import report_object
+from dora_systemd.decisions.why.report import (
+    Report,
+    Subject,
+    format_report,
+    remedies,
+    report_object,
+)
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.names import STORE, TREE
 from dora_systemd.values import SECOND

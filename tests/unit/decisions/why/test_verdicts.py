@@ -10,13 +10,13 @@ from dora_systemd.decisions.why.lives import (
     UNIT_MESSAGES,
     Happening,
     Life,
+    ended_nodes,
     find_lives,
     parse_happening,
     parse_number,
     plain_text,
     with_restarts,
 )
-from dora_systemd.decisions.why.nodes import ended_nodes
 from dora_systemd.decisions.why.postmortem import (
     UNKNOWN_PERSON,
     ended_word,

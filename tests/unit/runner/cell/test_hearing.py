@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
-from dora_systemd.decisions.cell.owed import PROBE, Owed
+from dora_systemd.decisions.cell.owes import PROBE, Owed
+from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.resources.oom import Oom, Owner
-from dora_systemd.decisions.rights.node_rights import NodeRights
 from tests.unit.fakes.dialogue import OPTIONS, Bench
 from tests.unit.fakes.loop import live
 from tests.unit.fakes.run import Calls

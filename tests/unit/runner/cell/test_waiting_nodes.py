@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.decisions.cell.asked import STOP
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.cell.status import STOP, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do
 from dora_systemd.runner.cell.pump import Pump

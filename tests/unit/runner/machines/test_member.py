@@ -16,11 +16,11 @@ from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.restarts import Life

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.decisions.cell.counters import LineCount
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -15,6 +14,7 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.resources.usage import LineCount
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.machines.roster import Roster
 from tests.unit.fakes.ends import FakeEnds

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.cgroup.strain import read_load, read_oom
-from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.cell.log_backlog import Marks
 from dora_systemd.decisions.resources.oom import Owner
 from dora_systemd.decisions.resources.pressure import CPU, MEMORY
+from dora_systemd.decisions.resources.usage import CpuSample
 from dora_systemd.runner.nodes.groups import Hold, Resources
 
 MIB = 1 << 20

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.rights import parse_node_rights
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.logs.lines import Origin
-from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants, raise_file_limit
 from tests.unit.adapters.logs.test_queue import SlowJournal

@@ -7,8 +7,8 @@ import pytest
 
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.rights import parse_node_rights
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import daemon_variables

@@ -27,9 +27,8 @@ from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.logs.lines import Origin
-from dora_systemd.decisions.signs.messages import parse_message
-from dora_systemd.decisions.signs.table import Sign
-from dora_systemd.decisions.signs.watchdogs import Watchdogs
+from dora_systemd.decisions.watchdog.messages import Sign, parse_message
+from dora_systemd.decisions.watchdog.watchdogs import Watchdogs
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes.nodes import Nodes

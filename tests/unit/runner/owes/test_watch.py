@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.decisions.cell.owed import PROBE, Owed
+from dora_systemd.decisions.cell.owes import PROBE, Owed
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State

@@ -9,11 +9,11 @@ import pytest
 
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.decisions.cell.hot_reload import START_FIRST, HotReload
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
-from dora_systemd.decisions.reload.steps import How
+from dora_systemd.decisions.reload.changes import How
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.reload.swap import NotReady
 from dora_systemd.values import SECOND

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.resources.usage import CpuSample
 from dora_systemd.decisions.views.dataflows import format_dataflows
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.prometheus import format_metrics

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owes import Owed
+from dora_systemd.decisions.cell.rights import parse_node_rights
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
-from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.decisions.views.facts import OutputRow
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_times

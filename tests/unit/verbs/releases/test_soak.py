@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.releases.progress import Step, starting, stopping

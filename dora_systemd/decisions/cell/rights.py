@@ -1,0 +1,307 @@
+"""What single nodes may do that the others may not, and the programs that set it. Pure.
+
+The runner's command line contains these rights, so this module imports only what loads quickly.
+
+The programs are those of util-linux and coreutils: prlimit(1), chrt(1), nice(1), taskset(1),
+choom(1). Each one sets one thing, and executes the next one. What raises rights is granted by the
+unit to all of its processes, see decisions/unit/properties.py. So the other nodes give it up here.
+They give up hard limits, which no process gets back. An OOM score adjustment can be lowered again,
+to what the unit has: the kernel keeps that value for all children.
+"""
+
+import re
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
+from operator import or_
+from typing import Any, NamedTuple
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import check_known, did_you_mean
+from dora_systemd.node_words import NodeWords, parse_node_words, refusal
+from dora_systemd.values import format_bool, parse_bool, quoted
+
+LOWEST_NICE, HIGHEST_NICE = -20, 19
+MOST_OOM = 1000
+"""The range of an OOM score adjustment, and of proc_pid_oom_score_adj(5), is from minus this."""
+REALTIME = ("fifo", "rr")
+_SHARING = ("batch", "idle", "other")
+_POLICIES = (*(f"{policy}:PRIORITY" for policy in REALTIME), *_SHARING)
+_ABOUT = NodeWords("a right", "rights", "scheduling=fifo:50,nice=-5")
+_PRIORITY = re.compile(r"0*([1-9][0-9]?)")
+_INTEGER = re.compile(r"[-+]?[0-9]{1,4}")
+
+
+def parse_scheduling(given: str) -> str:
+    """A policy of sched(7), with a priority if it is a realtime one. Raises as parse_nice does."""
+    policy, colon, priority = given.strip().partition(":")
+    if policy in _SHARING and not colon:
+        return policy
+    number = _PRIORITY.fullmatch(priority)
+    if policy in REALTIME and number:
+        return f"{policy}:{number[1]}"
+    hint = f"write {policy}:PRIORITY with 1 to 99, such as {policy}:50"
+    if policy not in REALTIME:
+        hint = did_you_mean(policy, _SHARING) or f"valid values: {', '.join(_POLICIES)}"
+    raise refusal(f"{quoted(given)} as scheduling", hint)
+
+
+def parse_nice(given: str) -> int:
+    """A nice value, see nice(1). Raises DoraSystemdError (USAGE)."""
+    hint = f"write a number from {LOWEST_NICE}, most important, to {HIGHEST_NICE}"
+    return _parse_integer(given, LOWEST_NICE, HIGHEST_NICE, "nice value", hint)
+
+
+def parse_oom(given: str) -> int:
+    """A value for OOMScoreAdjust= of systemd.exec(5). Raises DoraSystemdError (USAGE)."""
+    hint = f"write a number from {-MOST_OOM}, never killed, to {MOST_OOM}, killed first"
+    return _parse_integer(given, -MOST_OOM, MOST_OOM, "OOM score adjustment", hint)
+
+
+def _parse_integer(given: str, lowest: int, highest: int, what: str, hint: str) -> int:
+    text = given.strip()
+    if not _INTEGER.fullmatch(text) or not lowest <= int(text) <= highest:
+        raise refusal(f"{quoted(given)} as {what}", hint)
+    return int(text)
+
+
+def _parse_yes(text: str) -> bool:
+    """A boolean; the word alone means yes."""
+    return parse_bool(text or "yes")
+
+
+def is_realtime(scheduling: str) -> bool:
+    """Whether it comes before all processes without a realtime policy."""
+    return scheduling.partition(":")[0] in REALTIME
+
+
+def is_negative(value: int) -> bool:
+    """Whether it favours the node over other processes of the machine."""
+    return value < 0
+
+
+def _never(_: object) -> bool:
+    return False
+
+
+class Right(NamedTuple):
+    """One right of a node.
+
+    word: in `--node-rights NODE:WORD=VALUE`. key: the setting, below `nodes: NODE:`. parse, format:
+    text to value and back. raises: whether a value gives the node more than its user has.
+    """
+
+    word: str
+    key: str
+    parse: Callable[[str], Any]
+    format: Callable[[Any], str] = str
+    raises: Callable[[Any], bool] = _never
+
+
+RIGHTS = (
+    Right("scheduling", "scheduling", parse_scheduling, raises=is_realtime),
+    Right("nice", "nice", parse_nice, raises=is_negative),
+    Right("lock-memory", "lock_memory", _parse_yes, format_bool, raises=bool),
+    Right("oom-score-adjust", "oom_score_adjust", parse_oom, raises=is_negative),
+    Right("essential", "essential", _parse_yes, format_bool),
+)
+BY_WORD: Mapping[str, Right] = {right.word: right for right in RIGHTS}
+BY_KEY: Mapping[str, Right] = {right.key: right for right in RIGHTS}
+
+
+class NodeRights(NamedTuple):
+    """The rights of one node; None: not given, so as the other nodes.
+
+    The fields are the keys of RIGHTS. scheduling: as parse_scheduling() returns it. lock_memory: it
+    may lock all of its memory. essential: its final failure ends the dataflow.
+    """
+
+    node: str
+    scheduling: str | None = None
+    nice: int | None = None
+    lock_memory: bool | None = None
+    oom_score_adjust: int | None = None
+    essential: bool | None = None
+
+    @property
+    def priority(self) -> int:
+        """Its realtime priority, 0 without one."""
+        policy, _, priority = (self.scheduling or "").partition(":")
+        return int(priority) if policy in REALTIME else 0
+
+
+def given_rights(rights: NodeRights) -> dict[str, Any]:
+    """The values that are given, by key."""
+    return {key: value for key in BY_KEY if (value := getattr(rights, key)) is not None}
+
+
+def raises_rights(rights: NodeRights) -> bool:
+    """Whether only root may give them in system scope."""
+    return any(BY_KEY[key].raises(value) for key, value in given_rights(rights).items())
+
+
+def parse_node_rights(text: str) -> NodeRights:
+    """The rights in NODE:WORD=VALUE,WORD=VALUE. Raises DoraSystemdError (USAGE)."""
+    node, values = parse_node_words(text, _ABOUT, {right.word: right.parse for right in RIGHTS})
+    return NodeRights(node, **{BY_WORD[word].key: value for word, value in values.items()})
+
+
+def format_node_rights(rights: NodeRights) -> str:
+    """The inverse of parse_node_rights, for a node with rights."""
+    given = given_rights(rights).items()
+    pairs = (f"{BY_KEY[key].word}={BY_KEY[key].format(value)}" for key, value in given)
+    return f"{rights.node}:{','.join(pairs)}"
+
+
+def merge_node_rights(*sources: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
+    """The rights of several sources; later ones take precedence."""
+    by_node: dict[str, list[dict[str, Any]]] = {}
+    for source in sources:
+        for one in source:
+            by_node.setdefault(one.node, []).append(given_rights(one))
+    return tuple(NodeRights(node, **reduce(or_, given)) for node, given in by_node.items())
+
+
+def is_essential(rights: Iterable[NodeRights], node: str) -> bool:
+    """Whether the final failure of `node` ends the dataflow."""
+    return node in essential_nodes(rights)
+
+
+def essential_nodes(rights: Iterable[NodeRights]) -> tuple[str, ...]:
+    """The nodes whose final failure ends the dataflow."""
+    return tuple(one.node for one in rights if one.essential)
+
+
+def without_essential(rights: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
+    """The rights of nodes whose final failure ends nothing here."""
+    kept = (one._replace(essential=None) for one in rights)
+    return tuple(one for one in kept if given_rights(one))
+
+
+def has_process_rights(rights: Iterable[NodeRights]) -> bool:
+    """Whether a program has to set something for a node before it runs."""
+    return any(given_rights(one).keys() - {"essential", "oom_score_adjust"} for one in rights)
+
+
+def check_rights_nodes(
+    rights: Iterable[NodeRights], nodes: Iterable[str], launched: Container[str]
+) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for rights of a node that cannot have them.
+
+    nodes: all ids. launched: nodes that our launcher starts, which sets their rights.
+    """
+    given = list(rights)
+    check_known("cannot give rights to", [one.node for one in given], nodes)
+    for one in given:
+        if one.node not in launched and given_rights(one).keys() - {"essential"}:
+            message = f"cannot give rights to the node {quoted(one.node)}: something else starts it"
+            hint = "what starts a dynamic or ROS 2 node gives it its rights"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
+OTHERS = "*"
+"""Stands for all nodes without rights of their own; no node has this id."""
+NICE_LIMIT = 20
+"""RLIMIT_NICE is this minus the lowest nice value, see getrlimit(2)."""
+BEHIND_ESSENTIAL = 500
+"""What the others have more than an essential node: as if they used half of the memory more."""
+_PROGRAMS = "/usr/bin"
+
+
+@dataclass(frozen=True)
+class Base:
+    """What all processes of the unit have: nice value, OOM score adjustment.
+
+    bound: by node, the list of its CPUs, unless a cgroup keeps the node there.
+    """
+
+    nice: int = 0
+    oom: int = 0
+    bound: Mapping[str, str] = field(default_factory=dict)
+
+
+def rights_commands(rights: Sequence[NodeRights], base: Base) -> dict[str, list[str]]:
+    """The words before the program of each node with rights, and of all OTHERS."""
+    named = {one.node: one for one in rights}
+    known = {node: named.get(node, NodeRights(node)) for node in (*named, *base.bound, OTHERS)}
+    found = {node: _words(one, rights, base) for node, one in known.items()}
+    return found if any(found.values()) else {}
+
+
+def format_commands(commands: Mapping[str, Sequence[str]]) -> str:
+    """The lines for launcher.pl: a node id, a blank, and the words."""
+    return "".join(f"{node} {' '.join(words)}\n" for node, words in commands.items())
+
+
+def limits_of_others(rights: Sequence[NodeRights]) -> dict[str, int]:
+    """The limits that nodes without such a right give up, by the name of prlimit(1)."""
+    realtime = dict.fromkeys(("rtprio",) if any(one.priority for one in rights) else (), 0)
+    nice = dict.fromkeys(("nice",) if any(is_negative(one.nice or 0) for one in rights) else (), 0)
+    return {**realtime, **nice}
+
+
+def oom_of(one: NodeRights, rights: Sequence[NodeRights], base: Base) -> int:
+    """The OOM score adjustment of a node: its own, or a higher one if only others are essential."""
+    if one.oom_score_adjust is not None:
+        return one.oom_score_adjust
+    # What the unit would have without these rights.
+    usual = 0 if any(is_negative(one.oom_score_adjust or 0) for one in rights) else base.oom
+    is_behind = not one.essential and any(one.essential for one in rights)
+    return min(usual + BEHIND_ESSENTIAL * is_behind, MOST_OOM)
+
+
+def _words(one: NodeRights, rights: Sequence[NodeRights], base: Base) -> list[str]:
+    return [
+        *_limits(one, rights),
+        *_oom(one, rights, base),
+        *_bound(base.bound.get(one.node)),
+        *_nice(one, base),
+        *_scheduling(one.scheduling),
+    ]
+
+
+def _limits(one: NodeRights, rights: Sequence[NodeRights]) -> list[str]:
+    own = {"rtprio": one.priority, "nice": NICE_LIMIT - (one.nice or 0) if _favours(one) else 0}
+    kept = {name: own[name] for name in limits_of_others(rights)}
+    words = [f"--{name}={number}:{number}" for name, number in kept.items()]
+    words += ["--memlock=unlimited:unlimited"] if one.lock_memory else []
+    return _program("prlimit", *words) if words else []
+
+
+def _favours(one: NodeRights) -> bool:
+    return is_negative(one.nice or 0)
+
+
+def _oom(one: NodeRights, rights: Sequence[NodeRights], base: Base) -> list[str]:
+    wanted = oom_of(one, rights, base)
+    return [] if wanted == base.oom else _program("choom", "-n", str(wanted), "--")
+
+
+def _bound(cpus: str | None) -> list[str]:
+    return _program("taskset", "-c", cpus) if cpus else []
+
+
+def _nice(one: NodeRights, base: Base) -> list[str]:
+    more = 0 if one.nice is None else one.nice - base.nice
+    return _program("nice", "-n", str(more)) if more else []
+
+
+def _scheduling(scheduling: str | None) -> list[str]:
+    if scheduling is None:
+        return []
+    policy, _, priority = scheduling.partition(":")
+    assert bool(priority) == (policy in REALTIME)
+    return _program("chrt", f"--{policy}", priority or "0")
+
+
+def _program(name: str, *words: str) -> list[str]:
+    return [f"{_PROGRAMS}/{name}", *words]
+
+
+def described(one: NodeRights) -> str:
+    """The rights in words, for messages."""
+    texts = {True: "", False: "no "}
+    return ", ".join(
+        f"{texts[value]}{key}" if isinstance(value, bool) else f"{key} {value}"
+        for key, value in given_rights(one).items()
+    )

@@ -1,0 +1,76 @@
+"""What a node says to its notify socket, see sd_notify(3), and what the status table keeps of it.
+
+A node only reports about itself, so READY=1, MAINPID=, FDSTORE=1 and the like have no effect: dora
+knows when a node is ready, and which process it is.
+"""
+
+from typing import Any, NamedTuple
+
+from dora_systemd.values import INFINITY
+
+MAX_BYTES = 4096
+"""Maximum bytes of a message, as in systemd; a longer one is dropped."""
+MAX_STATUS = 200
+"""Characters kept of STATUS=."""
+
+
+class Message(NamedTuple):
+    """One message. status: the text of STATUS=, None without one; "" takes the last one back."""
+
+    is_alive: bool = False
+    is_trigger: bool = False
+    status: str | None = None
+
+
+def parse_message(data: bytes) -> Message:
+    """The message in a datagram. Whatever it contains, nothing is raised."""
+    alive = trigger = False
+    status = None
+    for line in data.split(b"\n"):
+        key, _, value = line.partition(b"=")
+        if key == b"WATCHDOG":
+            alive |= value == b"1"
+            trigger |= value == b"trigger"
+        elif key == b"STATUS":
+            status = _clean(value)
+    return Message(alive, trigger, status)
+
+
+def _clean(value: bytes) -> str:
+    """One line that cannot control a terminal: str.isprintable() knows such characters."""
+    text = value.decode("utf-8", "replace")
+    words = "".join(one if one.isprintable() else " " for one in text).split()
+    return " ".join(words)[:MAX_STATUS]
+
+
+class Sign(NamedTuple):
+    """What one node has said of itself.
+
+    status: the text of STATUS=, or "". at_us: CLOCK_MONOTONIC µs of its last WATCHDOG=1, 0: none.
+    watchdog: µs, 0 without one.
+    """
+
+    status: str = ""
+    at_us: int = 0
+    watchdog: int = 0
+
+
+def parse_sign(raw: Any) -> Sign:
+    """A sign in a table that the nodes' user can write; what is none becomes an empty one."""
+    match raw:
+        case [str() as status, int() as at_us, int() as watchdog] if _is_time(at_us, watchdog):
+            return Sign(status[:MAX_STATUS], at_us, watchdog)
+    return Sign()
+
+
+def _is_time(*numbers: int) -> bool:
+    return all(type(one) is int and 0 <= one < INFINITY // 2 for one in numbers)
+
+
+def sign_facts(sign: Sign, now_us: int) -> dict[str, Any]:
+    """The fields of a NodeRow. now_us: CLOCK_MONOTONIC."""
+    return {
+        "text": sign.status,
+        "watchdog": sign.watchdog or None,
+        "sign_age": max(now_us - sign.at_us, 0) if sign.at_us else None,
+    }
