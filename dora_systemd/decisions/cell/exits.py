@@ -21,16 +21,12 @@ class ExitKind(Enum):
 
 
 class Exit(NamedTuple):
-    """How a process ended; Exit() is success, or no end yet.
-
-    number: the exit status or the signal. words: what the text says after that. by: the node whose
-    failure was the cause, or "".
-    """
+    """How a process ended; Exit() is success, or no end yet."""
 
     kind: ExitKind = ExitKind.OTHER
-    number: int = 0
-    words: str = ""
-    by: str = ""
+    number: int = 0  # the exit status or the signal
+    words: str = ""  # what the text says after that
+    by: str = ""  # the node whose failure was the cause, or ""
 
     @property
     def is_failure(self) -> bool:

@@ -17,17 +17,14 @@ CHANGE_VARIABLE = "DORA_SYSTEMD_HOT_RELOAD"
 
 
 class HotReload(NamedTuple):
-    """Options of hot reload.
+    """Options of hot reload."""
 
-    is_on: whether files are watched at all. watch, ignore: patterns as in gitignore(5), empty for
-    the defaults. node_watch: additional patterns of single nodes. replace: by node, one of
-    REPLACE_WORDS; the key "" is for all other nodes.
-    """
-
-    is_on: bool = False
+    is_on: bool = False  # whether files are watched at all
+    # watch, ignore: patterns as in gitignore(5), empty for the defaults
     watch: tuple[str, ...] = ()
     ignore: tuple[str, ...] = ()
-    node_watch: tuple[tuple[str, str], ...] = ()
+    node_watch: tuple[tuple[str, str], ...] = ()  # additional patterns of single nodes
+    # by node, one of REPLACE_WORDS; the key "" is for all other nodes
     replace: tuple[tuple[str, str], ...] = ()
 
     def starts_first(self, node: str) -> bool:
@@ -44,13 +41,10 @@ DEFAULT_RELOAD = HotReload()
 
 
 class SettingsChange(NamedTuple):
-    """Changes of a settings file.
+    """Changes of a settings file."""
 
-    limits: those of nodes. others: keys that take effect at the next start.
-    """
-
-    limits: tuple[NodeLimits, ...]
-    others: tuple[str, ...]
+    limits: tuple[NodeLimits, ...]  # those of nodes
+    others: tuple[str, ...]  # keys that take effect at the next start
 
 
 def parse_of_node(text: str) -> tuple[str, str]:

@@ -40,19 +40,15 @@ DEFAULT_OPERATOR = "op"
 
 @dataclass(frozen=True)
 class LaunchPlan:
-    """The values to rewrite the descriptor with.
-
-    launcher: absolute path of launcher.pl. search_path: PATH of the nodes. exists: whether a file
-    with that absolute path exists. read: its content. environment: for variables in `env:`.
-    """
+    """The values to rewrite the descriptor with."""
 
     options: RunnerOptions
-    launcher: str
-    search_path: str
-    exists: Callable[[str], bool]
-    read: Read
+    launcher: str  # absolute path of launcher.pl
+    search_path: str  # PATH of the nodes
+    exists: Callable[[str], bool]  # whether a file with that absolute path exists
+    read: Read  # the content of a file
     session: BuildSession = field(default_factory=BuildSession)
-    environment: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)  # for variables in `env:`
 
 
 def launch_descriptor(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, Any]:

@@ -97,20 +97,15 @@ def _weight_file(weight: int) -> str:
 
 
 class Limit(NamedTuple):
-    """A resource that can be limited, for a dataflow and for a node.
+    """A resource that can be limited, for a dataflow and for a node."""
 
-    word: its name in `--node-limit NODE:WORD=VALUE`. key: the setting, in settings files. property:
-    of the unit, see systemd.resource-control(5). file: the control file of cgroup v2. parse,
-    format: text to value and back. file_text: the text for the control file.
-    """
-
-    word: str
-    key: str
-    property: str
-    file: str
-    parse: Callable[[str], int]
-    format: Callable[[int], str] = format_number
-    file_text: Callable[[int], str] = _plain_file
+    word: str  # its name in `--node-limit NODE:WORD=VALUE`
+    key: str  # the setting, in settings files
+    property: str  # of the unit, see systemd.resource-control(5)
+    file: str  # the control file of cgroup v2
+    parse: Callable[[str], int]  # text to value
+    format: Callable[[int], str] = format_number  # value to text
+    file_text: Callable[[int], str] = _plain_file  # the text for the control file
 
     def controller(self) -> str:
         """The controller of cgroup v2 that enforces it."""

@@ -125,12 +125,11 @@ class LineLimiter:
     """Counts the lines of one node.
 
     Each stream has its own window, so that a flood on standard output does not suppress a traceback
-    on standard error. A window begins with the first line after the last window. suppressed: number
-    of refused lines since take_suppressed().
+    on standard error. A window begins with the first line after the last window.
     """
 
     limit: RateLimit
-    suppressed: int = 0
+    suppressed: int = 0  # number of refused lines since take_suppressed()
     _windows: dict[str, _Window] = field(default_factory=dict)
 
     def admit(self, stream: str, count: int, now: float) -> int:

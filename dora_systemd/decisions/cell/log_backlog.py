@@ -19,14 +19,11 @@ BREATH = 0.02
 
 @dataclass(frozen=True)
 class Marks:
-    """Thresholds for freezing a node, in bytes that dora has written and the runner has not read.
+    """Thresholds for freezing a node, in bytes that dora wrote and the runner has not read."""
 
-    hold: freeze from here on. free: thaw below this. longest: maximum seconds of one freeze.
-    """
-
-    hold: int
-    free: int
-    longest: float = float("inf")
+    hold: int  # freeze from here on
+    free: int  # thaw below this
+    longest: float = float("inf")  # maximum seconds of one freeze
 
     def is_held(self, was_held: bool, seconds: float, backlog: int) -> bool:
         """Whether to freeze a node that was frozen, or ran, for so long. backlog: unread bytes."""

@@ -46,61 +46,41 @@ _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 
 class RunnerOptions(NamedTuple):
-    """All options of one runner; they do not change while its unit exists.
+    """All options of one runner; they do not change while its unit exists."""
 
-    name, uuid: of the dataflow.
-    dataflow: absolute path of the descriptor.
-    working_directory: absolute; nodes run there, and relative paths of nodes start there.
-    dora: absolute path of the dora executable.
-    venv: absolute path of the nodes' virtual environment, or None for the interpreter on PATH.
-    uv: run Python nodes by uv, as `dora start --uv`.
-    debug: make topics inspectable, as `dora start --debug`.
-    allow_shell_nodes: allow nodes with `path: shell`.
-    grace: µs for a node to exit after the stop request.
-    attached: the end of standard input requests a stop (`doractl run`).
-    exit_when_nodes_finish: overrides the descriptor's key of that name, unless None.
-    env_keys: names of the variables that override the descriptor's `env:`.
-    log_rates: rate limits of log lines, see dora_systemd.decisions.cell.line_rates.
-    node_limits, node_rights: of single nodes.
-    restart: policy of nodes without one in the descriptor.
-    node_restarts: policies of single nodes.
-    start_timeout: µs for all nodes to become ready, or INFINITY.
-    reload: files that cause a reload, and how nodes are replaced.
-    watchdogs: nodes with a notify socket, see dora_systemd.decisions.watchdog.watchdogs.
-    owes: outputs of nodes that have to come in time.
-    needs: the paths that single nodes wait for.
-    placed: the nodes that run on other machines than the head.
-    machine, head: on a member its name, and the host name of the head; else "".
-    addresses: with `link: direct` those of all machines, the own one first.
-    """
-
+    # name, uuid: of the dataflow
     name: str
     uuid: str
-    dataflow: str
-    working_directory: str
-    dora: str
+    dataflow: str  # absolute path of the descriptor
+    working_directory: str  # absolute; nodes run there, and relative paths of nodes start there
+    dora: str  # absolute path of the dora executable
+    # absolute path of the nodes' virtual environment, or None for the interpreter on PATH
     venv: str | None = None
-    uv: bool = False
-    debug: bool = False
-    allow_shell_nodes: bool = False
-    grace: int = DEFAULT_GRACE
-    attached: bool = False
+    uv: bool = False  # run Python nodes by uv, as `dora start --uv`
+    debug: bool = False  # make topics inspectable, as `dora start --debug`
+    allow_shell_nodes: bool = False  # allow nodes with `path: shell`
+    grace: int = DEFAULT_GRACE  # µs for a node to exit after the stop request
+    attached: bool = False  # the end of standard input requests a stop (`doractl run`)
+    # overrides the descriptor's key of that name, unless None
     exit_when_nodes_finish: bool | None = None
-    env_keys: tuple[str, ...] = ()
+    env_keys: tuple[str, ...] = ()  # names of the variables that override the descriptor's `env:`
+    # rate limits of log lines, see dora_systemd.decisions.cell.line_rates
     log_rates: RateLimits = UNLIMITED
-    node_limits: tuple[NodeLimits, ...] = ()
-    restart: RestartPolicy = DEFAULT
-    node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()
-    start_timeout: int = INFINITY
-    reload: HotReload = DEFAULT_RELOAD
+    node_limits: tuple[NodeLimits, ...] = ()  # of single nodes, as node_rights
+    restart: RestartPolicy = DEFAULT  # policy of nodes without one in the descriptor
+    node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()  # policies of single nodes
+    start_timeout: int = INFINITY  # µs for all nodes to become ready, or INFINITY
+    reload: HotReload = DEFAULT_RELOAD  # files that cause a reload, and how nodes are replaced
+    # nodes with a notify socket, see dora_systemd.decisions.watchdog.watchdogs
     watchdogs: Mapping[str, int] = {}
     node_rights: "tuple[NodeRights, ...]" = ()
-    owes: "tuple[Owed, ...]" = ()
-    needs: tuple[NodeNeed, ...] = ()
-    placed: tuple[Placed, ...] = ()
+    owes: "tuple[Owed, ...]" = ()  # outputs of nodes that have to come in time
+    needs: tuple[NodeNeed, ...] = ()  # the paths that single nodes wait for
+    placed: tuple[Placed, ...] = ()  # the nodes that run on other machines than the head
+    # machine, head: on a member its name, and the host name of the head; else ""
     machine: str = ""
     head: str = ""
-    addresses: tuple[str, ...] = ()
+    addresses: tuple[str, ...] = ()  # with `link: direct` those of all machines, the own one first
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -116,16 +96,13 @@ Format = Callable[[Any], str]
 
 
 class Option(NamedTuple):
-    """One option of the command line, `--key=value`, or `--key` if it is a flag.
-
-    field: of RunnerOptions. parse: the value of the field from the texts of all arguments with this
-    key. format: the inverse, a text for each argument.
-    """
+    """One option of the command line, `--key=value`, or `--key` if it is a flag."""
 
     key: str
-    field: str
+    field: str  # of RunnerOptions
+    # the value of the field, from the texts of all arguments with this key
     parse: Callable[[list[str]], Any]
-    format: Callable[[Any], list[str]]
+    format: Callable[[Any], list[str]]  # the inverse of parse: a text for each argument
     is_repeated: bool = False
     is_flag: bool = False
 

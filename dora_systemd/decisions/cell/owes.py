@@ -31,17 +31,13 @@ _HINT = f"write {_FORM}; within is required"
 
 
 class Owed(NamedTuple):
-    """One output that a node owes. node: "" where the place says which. Times in µs.
+    """One output that a node owes. Times in µs."""
 
-    within: between two messages. first: from the start of the node to its first message. then: one
-    of THEN.
-    """
-
-    node: str
+    node: str  # "" where the place says which
     output: str
-    within: int
-    first: int = FIRST
-    then: str = RESTART
+    within: int  # between two messages
+    first: int = FIRST  # from the start of the node to its first message
+    then: str = RESTART  # one of THEN
 
     @property
     def place(self) -> str:

@@ -33,15 +33,12 @@ _COUNT = re.compile(r"[0-9]{1,9}")
 
 
 class RestartPolicy(NamedTuple):
-    """An automatic restart policy. Times in µs.
+    """An automatic restart policy. Times in µs."""
 
-    policy: one of POLICIES. max_restarts: in one window, or INFINITY. delay: before the first
-    restart; it doubles with each restart, up to max_delay.
-    """
-
-    policy: str = "no"
-    max_restarts: int = 5
+    policy: str = "no"  # one of POLICIES
+    max_restarts: int = 5  # in one window, or INFINITY
     window: int = 600 * SECOND
+    # before the first restart; it doubles with each restart, up to max_delay
     delay: int = MIN_DELAY
     max_delay: int = 30 * SECOND
 

@@ -85,17 +85,14 @@ def _never(_: object) -> bool:
 
 
 class Right(NamedTuple):
-    """One right of a node.
+    """One right of a node."""
 
-    word: in `--node-rights NODE:WORD=VALUE`. key: the setting, below `nodes: NODE:`. parse, format:
-    text to value and back. raises: whether a value gives the node more than its user has.
-    """
-
-    word: str
-    key: str
+    word: str  # in `--node-rights NODE:WORD=VALUE`
+    key: str  # the setting, below `nodes: NODE:`
+    # parse, format: text to value and back
     parse: Callable[[str], Any]
     format: Callable[[Any], str] = str
-    raises: Callable[[Any], bool] = _never
+    raises: Callable[[Any], bool] = _never  # whether a value gives the node more than its user has
 
 
 RIGHTS = (
@@ -112,16 +109,15 @@ BY_KEY: Mapping[str, Right] = {right.key: right for right in RIGHTS}
 class NodeRights(NamedTuple):
     """The rights of one node; None: not given, so as the other nodes.
 
-    The fields are the keys of RIGHTS. scheduling: as parse_scheduling() returns it. lock_memory: it
-    may lock all of its memory. essential: its final failure ends the dataflow.
+    The fields are the keys of RIGHTS.
     """
 
     node: str
-    scheduling: str | None = None
+    scheduling: str | None = None  # as parse_scheduling() returns it
     nice: int | None = None
-    lock_memory: bool | None = None
+    lock_memory: bool | None = None  # it may lock all of its memory
     oom_score_adjust: int | None = None
-    essential: bool | None = None
+    essential: bool | None = None  # its final failure ends the dataflow
 
     @property
     def priority(self) -> int:
@@ -210,13 +206,11 @@ _PROGRAMS = "/usr/bin"
 
 @dataclass(frozen=True)
 class Base:
-    """What all processes of the unit have: nice value, OOM score adjustment.
-
-    bound: by node, the list of its CPUs, unless a cgroup keeps the node there.
-    """
+    """What all processes of the unit have: nice value, OOM score adjustment."""
 
     nice: int = 0
     oom: int = 0
+    # by node, the list of its CPUs, unless a cgroup keeps the node there
     bound: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -62,34 +62,25 @@ _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, R
 
 
 class NodeStatus(NamedTuple):
-    """One node as the runner sees it.
+    """One node as the runner sees it."""
 
-    state: one of NODE_STATES. pid: 0 if no process is known. restarts: number of restarts by dora
-    in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last process
-    ended. kind: how dora starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
-    policy: dora's restart policy, "never" if it has none, HELD or LATCHED. max_restarts: in one
-    window, 0 without limit. hung: why dora's health check or its watchdog ended the process, or "".
-    silent: which output that it owes has not come, or "". is_ended: the runner ends it for that.
-    needs: what it waits for, or "". machine: the name of the other machine that it runs on, or "".
-    asked: what was asked for, for decisions/cell/status.py, or "". asked_by: by whom. is_held:
-    whether dora only has a launcher of it, which waits because a stop was asked for.
-    """
-
-    state: str = "starting"
-    pid: int = 0
-    restarts: int = 0
-    since_us: int = 0
-    exit: Exit = Exit()
+    state: str = "starting"  # one of NODE_STATES
+    pid: int = 0  # 0 if no process is known
+    restarts: int = 0  # number of restarts by dora in this run
+    since_us: int = 0  # CLOCK_REALTIME µs of the last change of state
+    exit: Exit = Exit()  # how its last process ended
+    # how dora starts it (python, executable, shell, uv, operator, ros2, dynamic, url)
     kind: str = ""
-    policy: str = "never"
-    max_restarts: int = 0
-    hung: str = ""
-    silent: str = ""
-    is_ended: bool = False
-    needs: str = ""
-    machine: str = ""
-    asked: str = ""
-    asked_by: str = ""
+    policy: str = "never"  # dora's restart policy, "never" if it has none, HELD or LATCHED
+    max_restarts: int = 0  # in one window, 0 without limit
+    hung: str = ""  # why dora's health check or its watchdog ended the process, or ""
+    silent: str = ""  # which output that it owes has not come, or ""
+    is_ended: bool = False  # the runner ends the node because it is silent
+    needs: str = ""  # what it waits for, or ""
+    machine: str = ""  # the name of the other machine that it runs on, or ""
+    asked: str = ""  # RESTART or STOP, if somebody has asked for it, or ""
+    asked_by: str = ""  # who asked
+    # whether dora only has a launcher of it, which waits because a stop was asked for
     is_held: bool = False
 
     @property
@@ -99,29 +90,23 @@ class NodeStatus(NamedTuple):
 
 
 class CellStatus(NamedTuple):
-    """The content of status.json.
-
-    run: dora's own id of this run, or "". stage: one of STAGES. text: the unit's STATUS=.
-    started_us, ready_us: CLOCK_REALTIME µs, 0 if that has not happened. samples: the last
-    SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL.
-    up_us: CLOCK_MONOTONIC µs of READY=1, 0 before it, and in tables of older versions. is_first:
-    whether NRestarts= of the unit is certainly 0. signs: of nodes with a notify socket, for
-    parse_sign() of dora_systemd.decisions.watchdog.messages. usage: of nodes on other machines, for
-    parse_use() of dora_systemd.decisions.machines.usage.
-    """
+    """The content of status.json."""
 
     uuid: str = ""
-    run: str = ""
-    stage: str = "starting"
-    text: str = ""
+    run: str = ""  # dora's own id of this run, or ""
+    stage: str = "starting"  # one of STAGES
+    text: str = ""  # the unit's STATUS=
+    # started_us, ready_us: CLOCK_REALTIME µs, 0 if that has not happened
     started_us: int = 0
     ready_us: int = 0
     nodes: Mapping[str, NodeStatus] = {}
-    samples: tuple[CpuSample, ...] = ()
-    lines: Mapping[str, LineCount] = {}
-    up_us: int = 0
-    is_first: bool = False
+    samples: tuple[CpuSample, ...] = ()  # the last SAMPLES_KEPT CPU samples, oldest first
+    lines: Mapping[str, LineCount] = {}  # by node; lost ones count for WHOLE_CELL
+    up_us: int = 0  # CLOCK_MONOTONIC µs of READY=1, 0 before it, and in tables of older versions
+    is_first: bool = False  # whether NRestarts= of the unit is certainly 0
+    # of nodes with a notify socket, for parse_sign() of dora_systemd.decisions.watchdog.messages
     signs: Mapping[str, tuple[Any, ...]] = {}
+    # of nodes on other machines, for parse_use() of dora_systemd.decisions.machines.usage
     usage: Mapping[str, Sequence[Any]] = {}
 
     @property

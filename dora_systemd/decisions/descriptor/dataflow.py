@@ -154,13 +154,11 @@ def _reached(start: str, takers: Mapping[str, list[str]]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class BuildSession:
-    """The results of the last `dora build`, by node id, as absolute paths. `dora start` uses them.
+    """The results of the last `dora build` for `dora start`, by node id, as absolute paths."""
 
-    directories: where a node runs; for one from git that is its clone. envs: virtual environments
-    of `dora build --uv`; without --uv they do not exist.
-    """
-
+    # where a node runs; for one from git that is its clone
     directories: Mapping[str, str] = field(default_factory=dict)
+    # virtual environments of `dora build --uv`; without --uv they do not exist
     envs: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -51,34 +51,27 @@ class Input:
 
 @dataclass(frozen=True)
 class Node:
-    """One node of a descriptor.
-
-    path, args: as written, or "".
-    env: its own variables, with values as in YAML.
-    inputs, outputs: including those of its operators; with several operators as "operator/output".
-    restart_policy: "never", "on-failure" or "always"; "" if the descriptor has none.
-    backoff: the other restart keys that are set, such as restart_delay.
-    build, git: the command and the repository for `dora build`, or "".
-    keeps_output: whether dora must read its output: for outputs made of it (`send_stdout_as`,
-    `send_logs_as`), for `min_log_level`, and for an input from `dora/logs`.
-    working_directory: of `deploy:`, or "".
-    raw: the complete mapping.
-    """
+    """One node of a descriptor."""
 
     id: str
     kind: NodeKind
+    # path, args: as written, or ""
     path: str
     args: str
-    env: Mapping[str, object]
+    env: Mapping[str, object]  # its own variables, with values as in YAML
+    # inputs, outputs: including those of its operators; with several operators as "operator/output"
     inputs: tuple[Input, ...]
     outputs: frozenset[str]
-    restart_policy: str
-    backoff: Mapping[str, object]
+    restart_policy: str  # "never", "on-failure" or "always"; "" if the descriptor has none
+    backoff: Mapping[str, object]  # the other restart keys that are set, such as restart_delay
+    # build, git: the command and the repository for `dora build`, or ""
     build: str
     git: str
+    # whether dora must read its output: for outputs made of it (`send_stdout_as`, `send_logs_as`),
+    # for `min_log_level`, and for an input from `dora/logs`
     keeps_output: bool
-    working_directory: str
-    raw: Mapping[str, object] = field(repr=False)
+    working_directory: str  # of `deploy:`, or ""
+    raw: Mapping[str, object] = field(repr=False)  # the complete mapping
 
 
 def parse_node(node: object, place: int, source: str) -> Node:

@@ -10,14 +10,12 @@ _TOKEN = re.compile(r"[0-9A-Za-z._~+/=-]{1,512}")
 
 @dataclass(frozen=True)
 class Coordinator:
-    """Ports of 127.0.0.1 and a token.
+    """Ports of 127.0.0.1 and a token."""
 
-    port, token: of the coordinator. local_listen_port: the daemon's port for dynamic nodes; None if
-    they cannot reach it.
-    """
-
+    # port, token: of the coordinator
     port: int
     token: str
+    # the daemon's port for dynamic nodes; None if they cannot reach it
     local_listen_port: int | None
 
     def raw(self) -> dict[str, Any]:

@@ -20,13 +20,10 @@ PLAIN = "text/plain; charset=utf-8"
 
 @dataclass(frozen=True)
 class Request:
-    """A request with access granted.
+    """A request with access granted."""
 
-    path: without the query. scope: that of the gateway's dataflows.
-    """
-
-    path: str
-    scope: Scope
+    path: str  # without the query
+    scope: Scope  # that of the gateway's dataflows
 
 
 @dataclass(frozen=True)

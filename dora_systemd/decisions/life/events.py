@@ -12,12 +12,12 @@ from dora_systemd.decisions.resources.oom import Oom
 
 @dataclass(frozen=True)
 class Event:
-    """Base of all events. at_us: CLOCK_REALTIME µs at which the runner learned of it.
+    """Base of all events.
 
     An event with nothing else inherits all of it, and needs no dataclass of its own.
     """
 
-    at_us: int
+    at_us: int  # CLOCK_REALTIME µs at which the runner learned of it
 
 
 class CoordinatorListening(Event):
@@ -49,13 +49,13 @@ class Refused(Event):
 
 @dataclass(frozen=True)
 class Failed(Event):
-    """Code of the runner raised. what: what it could not do. error: the exception as text.
+    """Code of the runner raised.
 
     The code can be an action of the table, a task, or a callback of the loop.
     """
 
-    what: str
-    error: str
+    what: str  # what it could not do
+    error: str  # the exception as text
 
 
 @dataclass(frozen=True)
@@ -79,20 +79,14 @@ class AllReady(Event):
 
 @dataclass(frozen=True)
 class NodeExited(Event):
-    """A process of the node has exited.
-
-    will_restart: dora is going to execute it again.
-    is_stale: a newer process of the node is already running.
-    oom: the OOM kill, if the kernel killed it because of memory.
-    is_essential: the dataflow ends if the node has failed for good.
-    """
+    """A process of the node has exited."""
 
     node: str
     exit: Exit
-    will_restart: bool
-    is_stale: bool = False
-    oom: Oom | None = None
-    is_essential: bool = False
+    will_restart: bool  # dora is going to execute it again
+    is_stale: bool = False  # a newer process of the node is already running
+    oom: Oom | None = None  # the OOM kill, if the kernel killed it because of memory
+    is_essential: bool = False  # the dataflow ends if the node has failed for good
 
 
 @dataclass(frozen=True)
@@ -105,42 +99,34 @@ class NodeCascaded(Event):
 
 @dataclass(frozen=True)
 class NodeHung(Event):
-    """dora's health check, or the node's watchdog, ends the node.
-
-    reason: such as "unresponsive for 5322ms". record, details: the life event.
-    """
+    """dora's health check, or the node's watchdog, ends the node."""
 
     node: str
-    reason: str
+    reason: str  # such as "unresponsive for 5322ms"
+    # record, details: the life event
     record: str = "node-hung"
     details: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class NodeSilent(Event):
-    """An output that the node owes has not come. reason: such as "no image for 2s".
-
-    then: one of dora_systemd.decisions.cell.owes.THEN. silent: all that is missing of the node.
-    """
+    """An output that the node owes has not come."""
 
     node: str
     output: str
-    reason: str
-    then: str
-    silent: str
+    reason: str  # such as "no image for 2s"
+    then: str  # one of dora_systemd.decisions.cell.owes.THEN
+    silent: str  # all that is missing of the node
 
 
 @dataclass(frozen=True)
 class NodeSpeaks(Event):
-    """An output that was missing has come. reason: such as "image again after 3s".
-
-    silent: what is still missing of the node, or "".
-    """
+    """An output that was missing has come."""
 
     node: str
     output: str
-    reason: str
-    silent: str
+    reason: str  # such as "image again after 3s"
+    silent: str  # what is still missing of the node, or ""
 
 
 @dataclass(frozen=True)
@@ -178,14 +164,11 @@ class ResultKnown(Event):
 
 @dataclass(frozen=True)
 class ChildExited(Event):
-    """A child process has exited.
+    """A child process has exited."""
 
-    child: "coordinator" or "daemon". oom: as in NodeExited.
-    """
-
-    child: str
+    child: str  # "coordinator" or "daemon"
     exit: Exit
-    oom: Oom | None = None
+    oom: Oom | None = None  # as in NodeExited
 
 
 @dataclass(frozen=True)
@@ -209,26 +192,20 @@ class StopAnswered(Event):
 
 @dataclass(frozen=True)
 class NodeAsked(Event):
-    """Somebody has asked for a restart or a stop of one node; it follows.
-
-    what: RESTART or STOP of cell/status.py. by: who, and by which door. status: the initial status
-    of the next process after a restart.
-    """
+    """Somebody has asked for a restart or a stop of one node; it follows."""
 
     node: str
-    what: str
-    by: str
-    status: NodeStatus | None = None
+    what: str  # RESTART or STOP of cell/status.py
+    by: str  # who, and by which door
+    status: NodeStatus | None = None  # the initial status of the next process after a restart
 
 
 @dataclass(frozen=True)
 class NodeReloading(Event):
-    """The runner is about to end the node, and to start another process in its place.
-
-    status: the initial status of the new process, or None if there will be none.
-    """
+    """The runner is about to end the node, and to start another process in its place."""
 
     node: str
+    # the initial status of the new process, or None if there will be none
     status: NodeStatus | None = None
 
 
@@ -249,15 +226,11 @@ class NodeRemoved(Event):
 
 @dataclass(frozen=True)
 class ReloadNoted(Event):
-    """The result of the last reload. notice: what to show as long as it is true, or "".
+    """The result of the last reload."""
 
-    downstream: the nodes that depend on each node, if that has changed. essential: the nodes that
-    the dataflow needs, if the reload has failed.
-    """
-
-    notice: str
-    downstream: Downstream | None = None
-    essential: tuple[str, ...] = ()
+    notice: str  # what to show as long as it is true, or ""
+    downstream: Downstream | None = None  # the nodes that depend on each node, if that has changed
+    essential: tuple[str, ...] = ()  # the nodes that the dataflow needs, if the reload has failed
 
 
 class ReloadAsked(Event):
@@ -284,15 +257,12 @@ class Gathered(Event):
 
 @dataclass(frozen=True)
 class MachineLost(Event):
-    """A member does not take part in the run any more.
-
-    by: who has stopped its part there, or "". is_failure: whether its part has failed, while the
-    machine and the way to it are well.
-    """
+    """A member does not take part in the run any more."""
 
     machine: str
     reason: str
-    by: str = ""
+    by: str = ""  # who has stopped its part there, or ""
+    # whether its part has failed, while the machine and the way to it are well
     is_failure: bool = False
 
 

@@ -80,44 +80,33 @@ Action = Do | Record | Deadline
 
 @dataclass(frozen=True)
 class Cell:
-    """All that the runner knows of its cell.
+    """All that the runner knows of its cell. Moments (_us) are in µs of CLOCK_REALTIME."""
 
-    grace: µs. run: dora's id of the run, or "". nodes: the live table. started_us, ready_us:
-    CLOCK_REALTIME µs. stop_by: what requested the stop, or ""; stop_us: when that was, if nodes
-    were running, CLOCK_REALTIME µs. failure: why the cell fails, or "". exit: the future exit
-    status of the runner. cause, culprits: of the failure, and the nodes that caused it. downstream:
-    the nodes that depend on each node. is_again: whether this process has had a run before.
-    is_trial: whether the version before can come back. reload: whether the run ends for the next
-    one in this process. notice: the result of the last reload. is_attached: whether it belongs to
-    `doractl run`, which tells how the nodes ended after a stop, too. met_us: when a node last got
-    what it needs, CLOCK_REALTIME µs. machine: the name of this machine if it is a member. members:
-    the other machines, if it is the head. awaited: which of them is not there, and why. lost: those
-    that had joined and were lost. waits_for_lost: whether the loss of a machine leads to another
-    run in this process. early: the nodes that have ended for good before they had called dora.
-    """
-
-    grace: int
+    grace: int  # µs
     started_us: int
-    nodes: "Mapping[str, NodeStatus]"
+    nodes: "Mapping[str, NodeStatus]"  # the live table
     state: State = State.BOOTING
-    run: str = ""
+    run: str = ""  # dora's id of the run, or ""
     ready_us: int = 0
-    stop_by: str = ""
-    stop_us: int = 0
-    failure: str = ""
-    exit: RunnerExit = RunnerExit.OK
+    stop_by: str = ""  # what requested the stop, or ""
+    stop_us: int = 0  # when the stop was requested, if nodes were running
+    failure: str = ""  # why the cell fails, or ""
+    exit: RunnerExit = RunnerExit.OK  # the future exit status of the runner
+    # cause, culprits: of the failure, and the nodes that caused it
     cause: Cause = Cause.NONE
     culprits: tuple[str, ...] = ()
-    downstream: "Downstream" = field(default_factory=dict)
-    is_again: bool = False
-    is_trial: bool = False
-    reload: bool = False
-    notice: str = ""
+    downstream: "Downstream" = field(default_factory=dict)  # the nodes that depend on each node
+    is_again: bool = False  # whether this process has had a run before
+    is_trial: bool = False  # whether the version before can come back
+    reload: bool = False  # whether the run ends for the next one in this process
+    notice: str = ""  # the result of the last reload
+    # whether it belongs to `doractl run`, which tells how the nodes ended after a stop, too
     is_attached: bool = False
-    met_us: int = 0
-    machine: str = ""
-    members: tuple[str, ...] = ()
-    awaited: str = ""
-    lost: frozenset[str] = frozenset()
+    met_us: int = 0  # when a node last got what it needs
+    machine: str = ""  # the name of this machine if it is a member
+    members: tuple[str, ...] = ()  # the other machines, if it is the head
+    awaited: str = ""  # which machine is not connected, and why
+    lost: frozenset[str] = frozenset()  # machines that had joined, and were lost
+    # whether the loss of a machine leads to another run in this process
     waits_for_lost: bool = False
-    early: tuple[str, ...] = ()
+    early: tuple[str, ...] = ()  # the nodes that have ended for good before they had called dora

@@ -37,43 +37,37 @@ _DURATION = re.compile(r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:ms|s|min|m|h|d|w)")
 
 @dataclass(frozen=True)
 class LogQuery:
-    """The records to show, their order and form. "" and (): no restriction.
-
-    nodes: "" stands for the records of the dataflow itself. levels: by node, instead of `level`;
-    they need `nodes`. invocation: of systemd, one life of the unit. run: dora's id of one run.
-    boot: as in journalctl(1). since, until: as in systemd.time(7), or a duration, which means that
-    long ago. tail: number of last records, or ALL_LINES. cursor_file: begin after the record in
-    this file, and write the last one to it. others: more dataflows, of which only the matches
-    count.
-    """
+    """The records to show, their order and form. "" and (): no restriction."""
 
     scope: Scope
     name: str = ""
     uuid: str = ""
-    nodes: tuple[str, ...] = ()
-    invocation: str = ""
-    run: str = ""
+    nodes: tuple[str, ...] = ()  # "" stands for the records of the dataflow itself
+    invocation: str = ""  # of systemd, one life of the unit
+    run: str = ""  # dora's id of one run
     is_events: bool = False
     level: str = ""
+    # by node, instead of `level`; needs `nodes`
     levels: Mapping[str, str] = field(default_factory=dict)
-    boot: str = ""
+    boot: str = ""  # as in journalctl(1)
+    # since, until: as in systemd.time(7), or a duration, which means that long ago
     since: str = ""
     until: str = ""
     grep: str = ""
-    tail: str = ""
+    tail: str = ""  # number of last records, or ALL_LINES
     is_follow: bool = False
     is_reverse: bool = False
     is_quiet: bool = False
     want_unprintable: bool = False
     output: str = "short"
-    cursor_file: str = ""
+    cursor_file: str = ""  # begin after the record in this file, and write the last one to it
 
     @property
     def is_counted(self) -> bool:
         """Whether only some of the last records are wanted."""
         return self.tail not in ("", ALL_LINES)
 
-    others: tuple["LogQuery", ...] = ()
+    others: tuple["LogQuery", ...] = ()  # more dataflows, of which only the matches count
 
 
 def parse_level(text: str) -> str:

@@ -16,18 +16,15 @@ _LAST = 2**63 - 1
 
 @dataclass(frozen=True)
 class Facts:
-    """Of one account on one machine.
+    """Of one account on one machine."""
 
-    doractl, dora: versions, "" for none. program: absolute path of doractl. linger: whether the
-    user's manager outlives a session; True for root. now: CLOCK_REALTIME, µs.
-    """
-
+    # doractl, dora: versions, "" for none
     doractl: str
     dora: str
-    program: str
+    program: str  # absolute path of doractl
     user: str
-    linger: bool
-    now: int
+    linger: bool  # whether the user's manager outlives a session; True for root
+    now: int  # CLOCK_REALTIME, µs
 
     def to_json(self) -> str:
         """One line."""

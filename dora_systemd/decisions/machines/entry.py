@@ -50,20 +50,16 @@ OF_MACHINES = tuple(replace(one, per_node=False) for one in _UNIT)
 
 
 class Machine(NamedTuple):
-    """A declared machine.
-
-    directory: of the dataflow file there, absolute, or "" for the same as here. settings: with
-    their values. is_own: it is declared for this dataflow, and not for all in a config.yml. link:
-    one of LINKS. address, head_address: of the machine and of the head; "" if not given.
-    """
+    """A declared machine."""
 
     name: str
     host: Host
-    directory: str
+    directory: str  # of the dataflow file there, absolute, or "" for the same as here
     labels: Mapping[str, str]
-    settings: Sequence[tuple[Setting[Any], Any]]
-    is_own: bool
-    link: str = LINKS[0]
+    settings: Sequence[tuple[Setting[Any], Any]]  # with their values
+    is_own: bool  # it is declared for this dataflow, and not for all in a config.yml
+    link: str = LINKS[0]  # one of LINKS
+    # address, head_address: of the machine and of the head; "" if not given
     address: str = ""
     head_address: str = ""
 

@@ -43,17 +43,13 @@ _OPTIONS = {
 
 
 class LinkOptions(NamedTuple):
-    """The command line of a link.
+    """The command line of a link."""
 
-    socket: absolute path, of the head's runner. machine: the member. host: for ssh(1), as in -H.
-    words: the arguments of doractl on the member. identity: a file with a key, or "".
-    """
-
-    socket: str
-    machine: str
-    host: str
-    words: tuple[str, ...]
-    identity: str = ""
+    socket: str  # absolute path, of the head's runner
+    machine: str  # the member
+    host: str  # for ssh(1), as in -H
+    words: tuple[str, ...]  # the arguments of doractl on the member
+    identity: str = ""  # a file with a key, or ""
 
 
 def link_command(python: str, link: LinkOptions) -> list[str]:

@@ -39,14 +39,12 @@ _MOST_BYTES = 100_000
 
 
 class Member(NamedTuple):
-    """A machine that runs nodes of a dataflow whose head is here.
+    """A machine that runs nodes of a dataflow whose head is here."""
 
-    machine: its name. host: for ssh(1). words: the arguments of doractl there, which begin with
-    `member FILE`; nobody but doractl writes them, see dora_systemd.decisions.machines.wire.
-    """
-
-    machine: str
-    host: Host
+    machine: str  # its name
+    host: Host  # for ssh(1)
+    # the arguments of doractl there, which begin with `member FILE`; nobody but doractl writes
+    # them, see dora_systemd.decisions.machines.wire
     words: tuple[str, ...]
 
     def with_uuid(self, old: str, new: str) -> "Member":

@@ -24,12 +24,10 @@ _MOST_PERCENT = 100 * 8192
 
 
 class NodeUse(NamedTuple):
-    """The usage of a node that runs elsewhere.
-
-    cpu_percent, throttled: percentages as in a NodeRow, at the time when the member has read them.
-    """
+    """The usage of a node that runs elsewhere."""
 
     use: Usage
+    # cpu_percent, throttled: percentages as in a NodeRow, at the time when the member has read them
     cpu_percent: float
     throttled: float
 

@@ -34,13 +34,11 @@ ports, see ip_local_port_range in ip(7). The key of a machine names each of them
 
 @dataclass(frozen=True)
 class Forwards:
-    """Runner of the head to link: the ports of 127.0.0.1 that ssh makes the same on both machines.
+    """Runner of the head to link: ports of 127.0.0.1 that ssh makes the same on both machines."""
 
-    coordinator: the head listens. zenoh: by machine, HEAD for the head; each listens on its own.
-    None if the machines reach each other without ssh.
-    """
-
-    coordinator: int
+    coordinator: int  # the head listens on it
+    # by machine, HEAD for the head; each machine listens on its own port. None if the machines
+    # reach each other without ssh.
     zenoh: Mapping[str, int]
 
 
@@ -53,14 +51,11 @@ class Lost:
 
 @dataclass(frozen=True)
 class Unreached:
-    """Link to the runner of the head: no doractl runs there as a member.
-
-    tries: after so many in a row a start for which somebody waits is of no use; 0 if none is.
-    """
+    """Link to the runner of the head: no doractl runs there as a member."""
 
     reason: str
     hint: str
-    tries: int
+    tries: int  # after so many in a row a start for which somebody waits is of no use; 0 if none is
 
 
 @dataclass(frozen=True)
@@ -73,25 +68,22 @@ class Taken:
 
 @dataclass(frozen=True)
 class Part:
-    """Head to member: what it shall run. The settings come from the command line of `member`.
+    """Head to member: what it shall run. The settings come from the command line of `member`."""
 
-    name, uuid: of the dataflow. machine: the name of the member. token, coordinator: of the
-    coordinator. zenoh: where its daemon listens. digest: SHA-256 of the descriptor, hex. grace: µs.
-    doractl, dora: versions of the head. again: 0 if somebody waits for this start; else
-    what is missing may come later.
-    """
-
+    # name, uuid: of the dataflow
     name: str
     uuid: str
-    machine: str
+    machine: str  # the name of the member
+    # token, coordinator: of the coordinator
     token: str
     coordinator: int
-    zenoh: int
-    digest: str
-    grace: int
+    zenoh: int  # where its daemon listens
+    digest: str  # SHA-256 of the descriptor, hex
+    grace: int  # µs
+    # doractl, dora: versions of the head
     doractl: str
     dora: str
-    again: int = 0
+    again: int = 0  # 0 if somebody waits for this start; else what is missing may come later
     version: int = VERSION
 
 
@@ -140,14 +132,11 @@ class Refused:
 
 @dataclass(frozen=True)
 class Ended:
-    """Member to head: its part has ended or is about to. by: who asked for it, or "".
+    """Member to head: its part has ended or is about to."""
 
-    reason: one line, "" if all went well. failed: 1 if its part has failed by itself; 0 also if its
-    machine shuts down, or it has lost the head.
-    """
-
-    reason: str = ""
-    by: str = ""
+    reason: str = ""  # one line, "" if all went well
+    by: str = ""  # who asked for it, or ""
+    # 1 if its part has failed by itself; 0 also if its machine shuts down, or it has lost the head
     failed: int = 0
 
 

@@ -28,67 +28,50 @@ BEATS = 2
 
 @dataclass(frozen=True)
 class Look:
-    """What is known at one moment. at_us, beat_us, heard: CLOCK_MONOTONIC, 0 is never.
+    """What is known at one moment."""
 
-    beat_us: the last beat of the probe. heard: the last message of each slot of Feeds. lives: by
-    node that runs, when its process became ready. probe: the number of the one that has noted the
-    beat.
-    """
-
+    # at_us, beat_us, heard: CLOCK_MONOTONIC, 0 is never
     at_us: int
-    beat_us: int
-    heard: Sequence[int]
-    lives: Mapping[str, int]
-    probe: int = 0
+    beat_us: int  # the last beat of the probe
+    heard: Sequence[int]  # the last message of each slot of Feeds
+    lives: Mapping[str, int]  # by node that runs, when its process became ready
+    probe: int = 0  # the number of the one that has noted the beat
 
 
 @dataclass(frozen=True)
 class Ear:
-    """What is known of one owed output. Times in µs.
+    """What is known of one owed output. Times in µs."""
 
-    life: when the process that owes it became ready, 0 if none runs. heard: the last message.
-    has_come: whether this process has sent one. quiet: time that counts, without a message.
-    is_judged: this silence has been reported. is_silent: no message has come since a silence was
-    reported. silent_us: when that was. flows: the inputs of the node. starved: the one of them,
-    NODE/OUTPUT, that the silence comes from, or "".
-    """
-
-    life: int = 0
-    heard: int = 0
-    has_come: bool = False
-    quiet: int = 0
-    is_judged: bool = False
-    is_silent: bool = False
-    silent_us: int = 0
-    flows: tuple[Flow, ...] = ()
-    starved: str = ""
+    life: int = 0  # when the process that owes it became ready, 0 if none runs
+    heard: int = 0  # the last message
+    has_come: bool = False  # whether this process has sent one
+    quiet: int = 0  # time that counts, without a message
+    is_judged: bool = False  # this silence has been reported
+    is_silent: bool = False  # no message has come since a silence was reported
+    silent_us: int = 0  # when the silence was reported
+    flows: tuple[Flow, ...] = ()  # the inputs of the node
+    starved: str = ""  # the input, NODE/OUTPUT, that the silence comes from, or ""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A node has fallen silent, or it speaks again. words: such as "no image for 2s".
-
-    is_starved: the node is silent because it gets nothing.
-    """
+    """A node has fallen silent, or it speaks again."""
 
     owed: Owed
     is_silent: bool
-    words: str
-    is_starved: bool = False
+    words: str  # such as "no image for 2s"
+    is_starved: bool = False  # the node is silent because it gets nothing
 
 
 @dataclass(frozen=True)
 class Judge:
-    """The state of the watch over `owes`. at_us: the last look, 0 before the first.
-
-    probe: the one that was heard at the last look. feeds: what the nodes get.
-    """
+    """The state of the watch over `owes`."""
 
     owes: tuple[Owed, ...]
     ears: tuple[Ear, ...] = ()
-    at_us: int = 0
-    probe: int = 0
-    feeds: Feeds = NO_FEEDS
+    at_us: int = 0  # the last look, 0 before the first
+    probe: int = 0  # the one that was heard at the last look
+    feeds: Feeds = NO_FEEDS  # what the nodes get
 
     @property
     def tick(self) -> int:

@@ -81,15 +81,13 @@ _REGULAR = 4
 
 @dataclass(frozen=True)
 class Feeds:
-    """The inputs of owing nodes that the probe hears.
+    """The inputs of owing nodes that the probe hears."""
 
-    places: NODE/OUTPUT of each slot in the file of times: the owed outputs, then the others.
-    by_node: the slots of the inputs of each owing node. whole: the nodes of which every input is
-    heard: none is a timer, or comes from another machine.
-    """
-
+    # NODE/OUTPUT of each slot in the file of times: the owed outputs, then the others
     places: tuple[str, ...] = ()
+    # the slots of the inputs of each owing node
     by_node: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    # the nodes of which every input is heard: none is a timer, or comes from another machine
     whole: frozenset[str] = frozenset()
 
 
@@ -98,15 +96,11 @@ NO_FEEDS = Feeds()
 
 @dataclass(frozen=True)
 class Flow:
-    """What is known of one input. Times in µs.
+    """What is known of one input. Times in µs."""
 
-    heard: its last message, CLOCK_MONOTONIC. steady: how long messages came without a gap longer
-    than `within`. quiet: time that counts since the last message.
-    """
-
-    heard: int = 0
-    steady: int = 0
-    quiet: int = 0
+    heard: int = 0  # its last message, CLOCK_MONOTONIC
+    steady: int = 0  # how long messages came without a gap longer than `within`
+    quiet: int = 0  # time that counts since the last message
 
     def after(self, heard: int, step: int, within: int) -> "Flow":
         """The flow after a look. step: µs that count."""

@@ -33,28 +33,21 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
 class Property(NamedTuple):
-    """One property as StartTransientUnit takes it; the bus adapter unpacks it as a tuple.
+    """One property as StartTransientUnit takes it; the bus adapter unpacks it as a tuple."""
 
-    name: on D-Bus, such as "TimeoutStopUSec". signature: of D-Bus, such as "t". value: as the
-    signature requires: int, bool, str, and sequences for arrays and structs.
-    """
-
-    name: str
-    signature: str
-    value: Any
+    name: str  # on D-Bus, such as "TimeoutStopUSec"
+    signature: str  # of D-Bus, such as "t"
+    value: Any  # as the signature requires: int, bool, str, and sequences for arrays and structs
 
 
 @dataclass(frozen=True)
 class PropertyKind:
-    """How a value is parsed and formatted.
-
-    expected: a description for hints. parse: text to value; raises ValueError or DoraSystemdError.
-    format: value to the text after "KEY="; after a newline, that of one more line with this key.
-    """
+    """How a value is parsed and formatted."""
 
     signature: str
-    expected: str
-    parse: Callable[[str], Any]
+    expected: str  # a description for hints
+    parse: Callable[[str], Any]  # text to value; raises ValueError or DoraSystemdError
+    # value to the text after "KEY="; after a newline, that of one more line with this key
     format: Callable[[Any], str]
 
 

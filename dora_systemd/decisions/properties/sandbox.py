@@ -61,31 +61,23 @@ _MOUNTABLE = re.compile(r"[^\s\x00-\x1f\x7f\"'\\:]+")
 
 @dataclass(frozen=True)
 class Sandbox:
-    """The options of a sandbox.
+    """The options of a sandbox."""
 
-    level: one of LEVELS. network: one of NETWORKS. is_user: of a user's manager. is_root: the
-    nodes run as root. has_devices: some devices are allowed by name. is_realtime: the nodes
-    have realtime scheduling. has_rights: some node has rights that a program sets before it.
-    has_identity: the user fits into a namespace with the first 65536 ids. needed: absolute
-    paths to read, such as the project. writable: paths to write. firm: by path of these two,
-    the part that only root can replace; without an entry all of it. directory: the
-    RuntimeDirectory of the unit, the only one that nodes see; "": all are visible. denied: paths
-    to write that the nodes' user, `user`, must not write.
-    """
-
-    level: str = DEFAULT_LEVEL
-    network: str = DEFAULT_NETWORK
-    is_user: bool = False
-    is_root: bool = False
-    has_devices: bool = False
-    is_realtime: bool = False
-    has_rights: bool = False
-    has_identity: bool = True
-    needed: Sequence[str] = ()
-    writable: Sequence[str] = ()
+    level: str = DEFAULT_LEVEL  # one of LEVELS
+    network: str = DEFAULT_NETWORK  # one of NETWORKS
+    is_user: bool = False  # of a user's manager
+    is_root: bool = False  # the nodes run as root
+    has_devices: bool = False  # some devices are allowed by name
+    is_realtime: bool = False  # the nodes have realtime scheduling
+    has_rights: bool = False  # some node has rights that a program sets before it
+    has_identity: bool = True  # the user fits into a namespace with the first 65536 ids
+    needed: Sequence[str] = ()  # absolute paths to read, such as the project
+    writable: Sequence[str] = ()  # paths to write
+    # by path of `needed` and `writable`, the part that only root can replace; all without an entry
     firm: Mapping[str, str] = field(default_factory=dict)
+    # the RuntimeDirectory of the unit, the only one that nodes see; "": all are visible
     directory: str = ""
-    denied: Sequence[str] = ()
+    denied: Sequence[str] = ()  # paths to write that the nodes' user, `user`, must not write
     user: str = ""
 
     @property

@@ -43,15 +43,13 @@ share, for the path of the release is not in them. Packages have files that no P
 
 @dataclass(frozen=True)
 class BuildTask:
-    """What the program of the build's unit is told.
+    """What the program of the build's unit is told."""
 
-    name, uuid: of the dataflow. release: its id. directory: where the commands run, in their order.
-    """
-
+    # name, uuid: of the dataflow
     name: str
     uuid: str
-    release: str
-    directory: str
+    release: str  # its id
+    directory: str  # where the commands run, in their order
     commands: tuple[tuple[str, ...], ...]
 
 

@@ -21,31 +21,25 @@ FILE, LINK, DIRECTORY = "file", "link", "directory"
 
 @dataclass(frozen=True)
 class Found:
-    """A file of a project before it is copied.
+    """A file of a project before it is copied."""
 
-    path: relative to the project. kind: FILE, LINK, DIRECTORY, or a word for what no release has.
-    target: of a link. signature: changes with the content.
-    """
-
-    path: str
-    kind: str
+    path: str  # relative to the project
+    kind: str  # FILE, LINK, DIRECTORY, or a word for what no release has
     size: int = 0
     is_executable: bool = False
-    target: str = ""
-    signature: str = ""
+    target: str = ""  # of a link
+    signature: str = ""  # changes with the content
 
 
 @dataclass(frozen=True)
 class Stored:
-    """A file of a release. digest: SHA-256 of its content. target: only of a link.
-
-    is_built: the build has made it; the project has no such file.
-    """
+    """A file of a release."""
 
     size: int = 0
     is_executable: bool = False
-    digest: str = ""
-    target: str = ""
+    digest: str = ""  # SHA-256 of its content
+    target: str = ""  # only of a link
+    # the build has made it; the project has no such file
     is_built: bool = field(default=False, compare=False)
 
 

@@ -20,23 +20,19 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Manifest:
-    """A release.
-
-    dataflow: the path of its file in the tree. source: the project that it was copied from. user:
-    User= of its nodes, "" in user scope. created_us: CLOCK_REALTIME µs. versions: by
-    name of the program. given: options of its deploy by name of the setting, as of given_texts().
-    """
+    """A release."""
 
     id: str
     name: str
     uuid: str
-    dataflow: str
-    source: str
-    user: str
+    dataflow: str  # the path of its file in the tree
+    source: str  # the project that it was copied from
+    user: str  # User= of its nodes, "" in user scope
     revision: str
-    created_us: int
-    versions: Mapping[str, str] = field(default_factory=dict)
+    created_us: int  # CLOCK_REALTIME µs
+    versions: Mapping[str, str] = field(default_factory=dict)  # by name of the program
     files: Mapping[str, Stored] = field(default_factory=dict)
+    # options of its deploy by name of the setting, as of given_texts()
     given: Mapping[str, str | list[str]] = field(default_factory=dict)
 
     @property

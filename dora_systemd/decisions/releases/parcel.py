@@ -34,20 +34,15 @@ _MOST_SOURCE = 4096
 
 @dataclass(frozen=True)
 class Parcel:
-    """A project on its way to another host.
-
-    source: its directory, there for people only. dataflow: the path of its file, relative to it.
-    directory: the working directory, relative to it; None for that of the file. revision: of git,
-    or "". owner: the user whose files they are, "" for those of root and of who sends them.
-    """
+    """A project on its way to another host."""
 
     name: str
-    source: str
-    dataflow: str
-    directory: str | None
-    revision: str
+    source: str  # its directory, there for people only
+    dataflow: str  # the path of its file, relative to it
+    directory: str | None  # the working directory, relative to it; None for that of the file
+    revision: str  # of git, or ""
     files: Mapping[str, Stored] = field(default_factory=dict)
-    owner: str = ""
+    owner: str = ""  # the user whose files they are, "" for those of root and of who sends them
 
     @property
     def contents(self) -> list[Stored]:

@@ -21,21 +21,16 @@ _MOST_BYTES = 800
 
 
 class Switch(NamedTuple):
-    """One change of what runs.
+    """One change of what runs."""
 
-    at_us: CLOCK_REALTIME µs. former: the release that ended, "" if none ran. release: the one that
-    runs since, or "". how: why `former` ended, one of ENDS. by: who asked; "" if that is not known.
-    node: the one that failed, or "". invocation: of systemd, the life in which it did.
-    """
-
-    at_us: int
-    former: str
-    release: str
-    how: str
-    by: str = ""
+    at_us: int  # CLOCK_REALTIME µs
+    former: str  # the release that ended, "" if none ran
+    release: str  # the one that runs since, or ""
+    how: str  # why `former` ended, one of ENDS
+    by: str = ""  # who asked; "" if that is not known
     reason: str = ""
-    node: str = ""
-    invocation: str = ""
+    node: str = ""  # the one that failed, or ""
+    invocation: str = ""  # of systemd, the life in which `node` failed
 
     @property
     def is_commit(self) -> bool:

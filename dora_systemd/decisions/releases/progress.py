@@ -19,18 +19,14 @@ Amount = tuple[int, int]
 
 
 class Step(NamedTuple):
-    """A moment of a change of the release.
+    """A moment of a change of the release."""
 
-    stage: one of STAGES. text: for people. amount: bytes in COPY, µs in SOAK. nodes: those that are
-    ready, of all. passed: the verdict. is_last: of its stage.
-    """
-
-    stage: str
-    text: str
-    amount: Amount | None = None
-    nodes: Amount | None = None
-    passed: bool | None = None
-    is_last: bool = False
+    stage: str  # one of STAGES
+    text: str  # for people
+    amount: Amount | None = None  # bytes in COPY, µs in SOAK
+    nodes: Amount | None = None  # those that are ready, of all
+    passed: bool | None = None  # the verdict
+    is_last: bool = False  # of its stage
 
     @property
     def news(self) -> tuple[object, ...]:

@@ -15,28 +15,21 @@ _EDGES = ("inputs", "outputs", "operator", "operators", "ros2")
 
 @dataclass(frozen=True)
 class NodeSources:
-    """The files of one node.
+    """The files of one node."""
 
-    files: absolute paths of its program and the modules that it imports. text: its whole
-    definition, which may contain names of configuration files. rules: its own `watch` patterns.
-    fresh: those of the files that it runs in their present version.
-    """
-
+    # absolute paths of its program and the modules that it imports
     files: frozenset[str] = frozenset()
-    text: str = ""
-    rules: WatchRules | None = None
-    fresh: frozenset[str] = frozenset()
+    text: str = ""  # its whole definition, which may contain names of configuration files
+    rules: WatchRules | None = None  # its own `watch` patterns
+    fresh: frozenset[str] = frozenset()  # those of the files that it runs in their present version
 
 
 @dataclass(frozen=True)
 class Touched:
-    """Nodes affected by changed files, each with the first of these files.
-
-    descriptor: whether the dataflow file itself has changed.
-    """
+    """Nodes affected by changed files, each with the first of these files."""
 
     nodes: Mapping[str, str] = field(default_factory=dict)
-    descriptor: bool = False
+    descriptor: bool = False  # whether the dataflow file itself has changed
 
 
 def touched(changed: Iterable[str], dataflow: str, nodes: Mapping[str, NodeSources]) -> Touched:
@@ -69,17 +62,13 @@ def _owners(path: str, nodes: Mapping[str, NodeSources]) -> list[str]:
 
 @dataclass(frozen=True)
 class Difference:
-    """The differences of a descriptor, as node ids.
+    """The differences of a descriptor, as node ids."""
 
-    replaced: nodes with changes other than inputs and outputs. rewired: nodes with other inputs or
-    outputs, and no readers. whole: why the dataflow as a whole must restart, or "".
-    """
-
-    replaced: tuple[str, ...] = ()
-    rewired: tuple[str, ...] = ()
+    replaced: tuple[str, ...] = ()  # nodes with changes other than inputs and outputs
+    rewired: tuple[str, ...] = ()  # nodes with other inputs or outputs, and no readers
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
-    whole: str = ""
+    whole: str = ""  # why the dataflow as a whole must restart, or ""
 
     @property
     def is_empty(self) -> bool:

@@ -41,18 +41,14 @@ ALWAYS_IGNORED = (
 
 @dataclass(frozen=True)
 class WatchRules:
-    """The rules of one dataflow.
+    """The rules of one dataflow."""
 
-    root: absolute directory that patterns are relative to. watched: patterns of files. ignored:
-    patterns that take precedence. gitignores: by directory relative to root, lines of .gitignore.
-    files: absolute paths that are always watched.
-    """
-
-    root: str
-    watched: tuple[str, ...] = DEFAULT_WATCH
-    ignored: tuple[str, ...] = ()
+    root: str  # absolute directory that patterns are relative to
+    watched: tuple[str, ...] = DEFAULT_WATCH  # patterns of files
+    ignored: tuple[str, ...] = ()  # patterns that take precedence
+    # by directory relative to root, lines of .gitignore
     gitignores: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    files: frozenset[str] = frozenset()
+    files: frozenset[str] = frozenset()  # absolute paths that are always watched
 
     def has(self, path: str) -> bool:
         """Whether a change of the file `path` (absolute) causes a reload."""

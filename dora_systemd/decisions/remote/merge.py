@@ -22,16 +22,13 @@ MOST_BYTES = 16 << 20
 
 
 class Held(NamedTuple):
-    """A record, in the order in which it is printed. key: its time, negative for newest first.
+    """A record, in the order in which it is printed."""
 
-    arrived: in seconds of the clock of the caller. data: what is printed of it.
-    """
-
-    key: int
+    key: int  # its time, negative for newest first
     number: int
     host: str
-    arrived: float
-    data: bytes
+    arrived: float  # in seconds of the clock of the caller
+    data: bytes  # what is printed of it
 
 
 class Merge:

@@ -21,28 +21,20 @@ class Owner(Enum):
 
 @dataclass(frozen=True)
 class OomCounts:
-    """Counters of one group, which only increase.
+    """Counters of one group, which only increase."""
 
-    kills: OOM kills in the group and below it. refusals: how often the limit of this group itself
-    was the reason.
-    """
-
-    kills: int = 0
-    refusals: int = 0
+    kills: int = 0  # OOM kills in the group and below it
+    refusals: int = 0  # how often the limit of this group itself was the reason
 
 
 @dataclass(frozen=True)
 class Oom:
-    """The OOM kill of a node. Sizes in bytes.
-
-    peak: the node's maximum. limit: of the owner, 0 for the machine. most: the node with the
-    highest usage, and its size.
-    """
+    """The OOM kill of a node. Sizes in bytes."""
 
     owner: Owner
-    peak: int
-    limit: int = 0
-    most: str = ""
+    peak: int  # the node's maximum
+    limit: int = 0  # of the owner, 0 for the machine
+    most: str = ""  # the node with the highest usage, and its size
     most_held: int = 0
 
     @property

@@ -28,31 +28,25 @@ QUIET = 300 * SECOND
 
 @dataclass(frozen=True)
 class Load:
-    """One sample of a group.
+    """One sample of a group."""
 
-    held: bytes that the kernel cannot reclaim. limit: bytes, or None. stalled: percent of the last
-    10 s in which some process waited for memory. throttled: percent of the time since the last
-    sample in which the CPU limit throttled the group, None without one.
-    """
-
-    held: int = 0
-    limit: int | None = None
-    stalled: float = 0.0
+    held: int = 0  # bytes that the kernel cannot reclaim
+    limit: int | None = None  # bytes, or None
+    stalled: float = 0.0  # percent of the last 10 s in which some process waited for memory
+    # percent of the time since the last sample in which the CPU limit throttled the group, None
+    # without one
     throttled: float | None = None
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """The state of one alarm.
+    """The state of one alarm."""
 
-    bad, good: consecutive samples. is_on: reported, and not well again since. reported_us: time, or
-    0.
-    """
-
+    # bad, good: consecutive samples
     bad: int = 0
     good: int = 0
-    is_on: bool = False
-    reported_us: int = 0
+    is_on: bool = False  # the alarm was reported and has not cleared
+    reported_us: int = 0  # time, or 0
 
 
 Report = tuple[str, str, Mapping[str, str]]

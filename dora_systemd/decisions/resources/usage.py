@@ -13,8 +13,7 @@ WORTH_SHOWING = 1.0
 class Usage(NamedTuple):
     """The usage of one group.
 
-    memory_max is INFINITY where there is no limit; cpu_max, in µs per second, too. throttling:
-    periods in which the group wanted to run, and those in which it had to wait for its cpu.max.
+    memory_max is INFINITY where there is no limit; cpu_max, in µs per second, too.
     """
 
     cpu_us: int
@@ -22,20 +21,18 @@ class Usage(NamedTuple):
     memory_peak: int | None = None
     memory_max: int | None = None
     cpu_max: int | None = None
+    # periods in which the group wanted to run, and those in which it had to wait for its cpu.max
     throttling: tuple[int, int] = (0, 0)
 
 
 class Strain(NamedTuple):
-    """Counters of one group, which only increase, see the kernel's "Control Group v2" and "PSI".
+    """Counters of one group, which only increase, see the kernel's "Control Group v2" and "PSI"."""
 
-    stalled: by resource, µs in which some of its processes waited for it, and µs in which all did;
-    without resources that the kernel does not measure. throttled: µs of throttling by the CPU
-    limit. oom_kills: number of OOM kills.
-    """
-
+    # by resource, µs in which some of its processes waited for it, and µs in which all did; without
+    # resources that the kernel does not measure
     stalled: Mapping[str, tuple[int, int]] = {}
-    throttled: int = 0
-    oom_kills: int = 0
+    throttled: int = 0  # µs of throttling by the CPU limit
+    oom_kills: int = 0  # number of OOM kills
 
 
 def limit_of(value: int | None) -> int | None:
@@ -79,14 +76,11 @@ SHORTEST_WINDOW_US = 1_000_000
 
 
 class CpuSample(NamedTuple):
-    """CPU time used until `at_us` (CLOCK_MONOTONIC µs), in µs, by node id.
-
-    throttling: periods in which the node was runnable, and periods in which its limit throttled it.
-    The key WHOLE_CELL is the unit's whole cgroup.
-    """
+    """CPU time until `at_us` (CLOCK_MONOTONIC), by node; WHOLE_CELL is the unit's cgroup. In µs."""
 
     at_us: int
     cpu_us: Mapping[str, int] = {}
+    # periods in which the node was runnable, and periods in which its limit throttled it
     throttling: Mapping[str, tuple[int, int]] = {}
 
 

@@ -30,58 +30,44 @@ Base = PurePath | None
 
 @dataclass(frozen=True)
 class Kind(Generic[T]):
-    """One kind of value.
+    """One kind of value."""
 
-    schema: what a settings file may contain, as a type for pydantic.
-    expected: the same in words, for messages.
-    parse: from the text of a flag or variable, a sequence of texts, or a settings file's value.
-    format: the text from which parse makes the same value; several texts for repeatable kinds.
-    is_flag: `--x` and `--no-x` without a value.
-    is_repeatable: the flag may be given more than once.
-    merge: joins the values of two sources, higher precedence last; None: only the latter counts.
-    metavar: the value in --help, such as TIME; a setting may have a better one.
-    """
-
-    schema: Any
-    expected: str
+    schema: Any  # what a settings file may contain, as a type for pydantic
+    expected: str  # the same in words, for messages
+    # from the text of a flag or variable, a sequence of texts, or a settings file's value
     parse: Callable[[Any, Base], T]
+    # the text from which parse makes the same value; several texts for repeatable kinds
     format: Callable[[T], Sequence[str]]
-    is_flag: bool = False
-    is_repeatable: bool = False
+    is_flag: bool = False  # `--x` and `--no-x` without a value
+    is_repeatable: bool = False  # the flag may be given more than once
+    # joins the values of two sources, higher precedence last; None: only the latter counts
     merge: Callable[[T, T], T] | None = None
-    metavar: str = ""
+    metavar: str = ""  # the value in --help, such as TIME; a setting may have a better one
 
 
 @dataclass(frozen=True)
 class Setting(Generic[T]):
-    """One setting.
+    """One setting."""
 
-    name: its key in settings files.
-    help: one sentence, for --help and the manual.
-    flags: its options, the long one first; a kind with is_flag has `--no-...` as well. Without any
-    it is the name with "-" for "_".
-    variable: the environment variable. Without one it is DORA_ and the name, or for a repeatable
-    kind there is none.
-    per_node: also valid below `nodes: NODE:` in a settings file.
-    property: the systemd property with the same value, as in a unit file, or "".
-    root_only: the setting makes root read, run or grant something. In system scope it is only valid
-    in a settings file that root alone can have written.
-    only_nodes: only valid below `nodes: NODE:`, so there is no flag and no variable.
-    raises: whether a value, of a node or of the dataflow, gives more than the user of the dataflow
-    has. In system scope such a value is only valid where root_only settings are.
-    """
-
-    name: str
+    name: str  # its key in settings files
     kind: Kind[Any]
     default: T
-    help: str
+    help: str  # one sentence, for --help and the manual
+    # its options, the long one first; a kind with is_flag has `--no-...` as well. Without any it is
+    # the name with "-" for "_".
     flags: tuple[str, ...] = ()
+    # the environment variable. Without one it is DORA_ and the name, or for a repeatable kind there
+    # is none.
     variable: str = ""
     metavar: str = ""
-    per_node: bool = False
-    property: str = ""
+    per_node: bool = False  # also valid below `nodes: NODE:` in a settings file
+    property: str = ""  # the systemd property with the same value, as in a unit file, or ""
+    # the setting makes root read, run or grant something. In system scope it is only valid in a
+    # settings file that root alone can have written.
     root_only: bool = False
-    only_nodes: bool = False
+    only_nodes: bool = False  # only valid below `nodes: NODE:`, so there is no flag and no variable
+    # whether a value, of a node or of the dataflow, gives more than the user of the dataflow has.
+    # In system scope such a value is only valid where root_only settings are.
     raises: Callable[[Any], bool] | None = None
 
     def __post_init__(self) -> None:

@@ -28,15 +28,12 @@ _CONTROLLERS = {
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine's size: memory in bytes, number of processors, maximum tasks, and online CPUs.
-
-    cpus: None if they are not known.
-    """
+    """The machine's size: memory in bytes, number of processors, maximum tasks, and online CPUs."""
 
     memory: int
     cores: int
     tasks: int
-    cpus: frozenset[int] | None = None
+    cpus: frozenset[int] | None = None  # None if they are not known
 
 
 def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> dict[str, str]:

@@ -52,17 +52,14 @@ MAX_JSON = 1024 * 1024
 
 @dataclass(frozen=True)
 class Settings:
-    """The values of all settings and their sources; `settings[VENV]` has the type of VENV.
-
-    sources: by name of the setting: a flag, a variable's name, a file's path or DEFAULT_SOURCE.
-    nodes: by node id, the per-node values by name of the setting. table: the existing settings.
-    lent: in system scope, environment files that only others than root name.
-    """
+    """The values of all settings and their sources; `settings[VENV]` has the type of VENV."""
 
     values: Mapping[str, Any]
+    # by name of the setting: a flag, a variable's name, a file's path or DEFAULT_SOURCE
     sources: Mapping[str, str]
-    nodes: Mapping[str, Mapping[str, Any]]
-    table: Sequence[Setting[Any]] = field(default=SETTINGS, repr=False)
+    nodes: Mapping[str, Mapping[str, Any]]  # by node id, the per-node values by name of the setting
+    table: Sequence[Setting[Any]] = field(default=SETTINGS, repr=False)  # the existing settings
+    # in system scope, environment files that only others than root name
     lent: frozenset[str] = frozenset()
 
     def __getitem__(self, setting: Setting[T]) -> T:

@@ -52,21 +52,16 @@ _ENDS_OF_ATTACHED = (RunnerExit.OK, RunnerExit.FAILED_AT_STOP)
 
 @dataclass(frozen=True)
 class UnitContext:
-    """What the unit needs besides the runner's options.
+    """What the unit needs besides the runner's options."""
 
-    python: absolute path of the interpreter that runs dora-systemd itself. is_user: whether the
-    unit is one of a user's manager. user: User= in system scope; None runs everything as root.
-    environment: all of Environment=, see unit_environment. credentials: absolute path by name.
-    sandbox: None for no sandbox. clock: the service that waits for the right time, or "".
-    """
-
-    python: str
-    is_user: bool
-    user: str | None = None
+    python: str  # absolute path of the interpreter that runs dora-systemd itself
+    is_user: bool  # whether the unit is one of a user's manager
+    user: str | None = None  # User= in system scope; None runs everything as root
+    # all of Environment=, see unit_environment
     environment: Mapping[str, str] = field(default_factory=dict)
-    credentials: Mapping[str, str] = field(default_factory=dict)
-    sandbox: Sandbox | None = None
-    clock: str = ""
+    credentials: Mapping[str, str] = field(default_factory=dict)  # absolute path by name
+    sandbox: Sandbox | None = None  # None for no sandbox
+    clock: str = ""  # the service that waits for the right time, or ""
 
 
 def unit_properties(

@@ -18,12 +18,9 @@ _MARKS = ("dora-systemd", "doractl(1)", "dora dataflows")
 
 
 class SetupFile(NamedTuple):
-    """A file of the project, and its path below the root: with a text or, with `link`, as a link.
+    """A file of the project, and its path below the root; with `link` a symbolic link."""
 
-    source: its kind (a directory of the project) and its name.
-    """
-
-    source: tuple[str, str]
+    source: tuple[str, str]  # its kind (a directory of the project) and its name
     place: str
     link: str = ""
 

@@ -27,29 +27,16 @@ Sample = tuple[Labels, float | int]
 
 
 class OutputRow(NamedTuple):
-    """An output that a node owes. within: µs. age: µs since its last message, None: none yet.
-
-    then: one of dora_systemd.decisions.cell.owes.THEN.
-    """
+    """An output that a node owes."""
 
     output: str
-    within: int
-    then: str
-    age: int | None = None
+    within: int  # µs
+    then: str  # one of dora_systemd.decisions.cell.owes.THEN
+    age: int | None = None  # µs since its last message, None: none yet
 
 
 class NodeRow(NamedTuple):
-    """One row of `list SELECTOR`. Sizes in bytes, cpu in percent of one processor, None: unknown.
-
-    cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
-    which its CPU limit throttled it, None without one. since: time of its last change of state,
-    CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
-    must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
-    the dataflow. scheduling: as in the settings, or "". cpus: those that it may use, "" if the
-    settings name none. silent: what is missing of the outputs that it owes, or "". needs: what it
-    waits for, or "". machine: the machine of the node, "" for this one. stopped_by: who requested
-    the stop of this node alone, or "".
-    """
+    """One row of `list SELECTOR`. Sizes in bytes, cpu in percent of a processor; None: unknown."""
 
     node: str
     state: str
@@ -60,21 +47,24 @@ class NodeRow(NamedTuple):
     restarts: int | None = None
     max_restarts: int | None = None
     exit: str = ""
+    # cpu_limit, memory_limit: the group's own, or None
     cpu_limit: float | None = None
     memory_limit: int | None = None
+    # the percentage of the time in which its CPU limit throttled it, None without one
     throttled: float | None = None
-    since: int = 0
-    text: str = ""
+    since: int = 0  # time of its last change of state, CLOCK_REALTIME µs, 0: unknown
+    text: str = ""  # its own STATUS=
+    # watchdog, sign_age: the time in which it must send WATCHDOG=1, and how long ago it did, in µs
     watchdog: int | None = None
     sign_age: int | None = None
-    essential: bool | None = None
-    scheduling: str = ""
-    cpus: str = ""
-    silent: str = ""
-    needs: str = ""
+    essential: bool | None = None  # whether its final failure ends the dataflow
+    scheduling: str = ""  # as in the settings, or ""
+    cpus: str = ""  # those that it may use, "" if the settings name none
+    silent: str = ""  # what is missing of the outputs that it owes, or ""
+    needs: str = ""  # what it waits for, or ""
     outputs: tuple[OutputRow, ...] = ()
-    machine: str = ""
-    stopped_by: str = ""
+    machine: str = ""  # the machine of the node, "" for this one
+    stopped_by: str = ""  # who requested the stop of this node alone, or ""
 
     @property
     def word(self) -> str:
@@ -83,29 +73,26 @@ class NodeRow(NamedTuple):
 
 
 class Fact(NamedTuple):
-    """One fact, and where it is shown.
+    """One fact, and where it is shown."""
 
-    key: in JSON. field: of NodeRow, if that has another name. value: that of JSON, from that of the
-    field. told: how it is read from the runner's table; without it, verbs/facts/list.py reads it.
-    is_moment: whether it is a time, which has two keys. column, cell: of the table of nodes, which
-    has the column if one of them `has` it; rank: those with a higher one are further to the right.
-    metric, help, samples: a metric, each sample with the labels that only this one has; without
-    `samples` it is the field, which has µs. is_label: whether the metric "info" has it.
-    """
-
-    key: str
-    field: str = ""
+    key: str  # in JSON
+    field: str = ""  # of NodeRow, if that has another name
+    # the value in JSON, from that of the field
     value: Callable[[Any], Any] = lambda value: None if value == "" else value
+    # reads the fact from the runner's table; verbs/facts/list.py reads facts without it
     told: Callable[["NodeStatus"], Any] | None = None
-    is_moment: bool = False
+    is_moment: bool = False  # whether it is a time, which has two keys
+    # column, cell: of the table of nodes, which has the column if one of them `has` it
     column: str = ""
     cell: Callable[[NodeRow], str] | None = None
     has: Callable[[NodeRow], object] = lambda _: True
-    rank: int = 0
+    rank: int = 0  # columns with a higher rank are further to the right
+    # metric, help, samples: a metric, each sample with the labels that only this one has; without
+    # `samples` it is the field, which has µs
     metric: str = ""
     help: str = ""
     samples: Callable[[NodeRow], list[Sample]] | None = None
-    is_label: bool = False
+    is_label: bool = False  # whether the metric "info" has it
 
     def of(self, row: Any) -> Any:
         """The field of a row; None for what a row has not."""

@@ -134,19 +134,16 @@ _BEST_GOVERNOR = "performance"
 
 @dataclass(frozen=True)
 class RealTime:
-    """What decides about real time on this machine.
+    """What decides about real time on this machine."""
 
-    has_groups: whether CONFIG_RT_GROUP_SCHED of the kernel keeps realtime from the group of a node,
-    whatever root may have in its own; None: not known. is_granted: whether root could have a
-    realtime priority; None: nobody tried, or not as root. can_raise: the same for higher limits.
-    isolated: list of isolated CPUs, or "". governors: of the CPU frequency, without double ones.
-    """
-
+    # whether CONFIG_RT_GROUP_SCHED of the kernel keeps realtime from the group of a node, whatever
+    # root may have in its own; None: not known
     has_groups: bool | None = None
+    # whether root could have a realtime priority; None: nobody tried, or not as root
     is_granted: bool | None = None
-    can_raise: bool | None = None
-    isolated: str = ""
-    governors: tuple[str, ...] = ()
+    can_raise: bool | None = None  # whether root could have higher limits; None as for is_granted
+    isolated: str = ""  # list of isolated CPUs, or ""
+    governors: tuple[str, ...] = ()  # of the CPU frequency, without double ones
 
 
 def judge_real_time(facts: RealTime) -> Iterator[Finding]:

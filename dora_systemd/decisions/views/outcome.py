@@ -28,18 +28,15 @@ class Thing(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result for one dataflow or Thing.
-
-    problem: "" for success. is_news: whether anything had to be done. details: what else a program
-    may need, by key. hint, code: as in DoraSystemdError, of a problem.
-    """
+    """The result for one dataflow or Thing."""
 
     subject: Subject
     text: str
-    problem: str = ""
-    is_news: bool = True
+    problem: str = ""  # "" for success
+    is_news: bool = True  # whether anything had to be done
     node: str = ""
-    details: Mapping[str, Any] = field(default_factory=dict)
+    details: Mapping[str, Any] = field(default_factory=dict)  # what else a program may need, by key
+    # hint, code: as in DoraSystemdError, of a problem
     hint: str = ""
     code: ExitCode = ExitCode.FAILURE
 

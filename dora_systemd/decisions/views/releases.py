@@ -20,19 +20,15 @@ _UNENDED = "its trial did not end"
 
 
 class ReleaseRow(NamedTuple):
-    """A release.
-
-    tree: the directory of its files. manifest: None if it is not readable. ran_us: when it began to
-    run the last time. end: what made it bad, or its last end; None if there was none.
-    """
+    """A release."""
 
     name: str
     id: str
     state: str
-    tree: str
-    manifest: Manifest | None
-    ran_us: int = 0
-    end: Switch | None = None
+    tree: str  # the directory of its files
+    manifest: Manifest | None  # None if it is not readable
+    ran_us: int = 0  # when it began to run the last time
+    end: Switch | None = None  # what made it bad, or its last end; None if there was none
 
     @property
     def why(self) -> str:

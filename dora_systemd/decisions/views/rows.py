@@ -8,17 +8,13 @@ from dora_systemd.names import release_of
 
 
 class Holder(NamedTuple):
-    """A process that inhibits restarts of a dataflow. pid: 0 if it is not known.
+    """A process that inhibits restarts of a dataflow."""
 
-    node: of the dataflow to which the process belongs, or "". why: the reason that the process has
-    written, or "".
-    """
-
-    pid: int
+    pid: int  # 0 if it is not known
     user: str = ""
     command: str = ""
-    node: str = ""
-    why: str = ""
+    node: str = ""  # of the dataflow to which the process belongs, or ""
+    why: str = ""  # the reason that the process has written, or ""
 
     def values(self) -> dict[str, Any]:
         """The holder for JSON."""
@@ -28,12 +24,7 @@ class Holder(NamedTuple):
 class DataflowRow(NamedTuple):
     """One row of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: unknown.
 
-    Other fields are as in NodeRow, for the whole dataflow. enabled: whether it is started at boot.
-    problem: why its node table is not valid, or "". inhibitors: who inhibits its restart.
-    listed_release: that in the Description= of its unit, for a row without `dataflow`. needs: what
-    systemd waits for before it starts it, or ""; waits_since: since when, CLOCK_REALTIME µs.
-    machines: the others that run nodes of it. machine: the name of this one, if the head is
-    elsewhere, or "".
+    Other fields are as in NodeRow, for the whole dataflow.
     """
 
     uuid: str
@@ -57,14 +48,14 @@ class DataflowRow(NamedTuple):
     restarts: int | None = None
     restart_budget: Mapping[str, int | None] | None = None
     nodes: tuple[NodeRow, ...] = ()
-    enabled: bool = False
-    problem: str = ""
-    inhibitors: tuple[Holder, ...] = ()
-    listed_release: str = ""
-    needs: str = ""
-    waits_since: int = 0
-    machines: tuple[str, ...] = ()
-    machine: str = ""
+    enabled: bool = False  # whether it is started at boot
+    problem: str = ""  # why its node table is not valid, or ""
+    inhibitors: tuple[Holder, ...] = ()  # who inhibits its restart
+    listed_release: str = ""  # that in the Description= of its unit, for a row without `dataflow`
+    needs: str = ""  # what systemd waits for before it starts the dataflow, or ""
+    waits_since: int = 0  # since when systemd waits, CLOCK_REALTIME µs
+    machines: tuple[str, ...] = ()  # the other machines that run nodes of the dataflow
+    machine: str = ""  # the name of this machine if the head is elsewhere, or ""
 
     @property
     def release(self) -> str:

@@ -14,15 +14,12 @@ from dora_systemd.decisions.views.rows import DataflowRow
 
 @dataclass(frozen=True)
 class Observed:
-    """A dataflow. at_us: time of its counters, CLOCK_MONOTONIC.
+    """A dataflow."""
 
-    row: its row in `list`. unit_restarts: number of automatic restarts by systemd. usage, strains,
-    lines: by node, WHOLE_CELL is the whole dataflow; empty if it is not up.
-    """
-
-    row: DataflowRow
-    at_us: int = 0
-    unit_restarts: int = 0
+    row: DataflowRow  # its row in `list`
+    at_us: int = 0  # time of its counters, CLOCK_MONOTONIC
+    unit_restarts: int = 0  # number of automatic restarts by systemd
+    # usage, strains, lines: by node, WHOLE_CELL is the whole dataflow; empty if it is not up
     usage: Mapping[str, Usage] = field(default_factory=dict)
     strains: Mapping[str, Strain] = field(default_factory=dict)
     lines: Mapping[str, LineCount] = field(default_factory=dict)

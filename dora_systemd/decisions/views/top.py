@@ -43,16 +43,13 @@ class Look:
 
 
 class TopRow(NamedTuple):
-    """One line of the table: a dataflow, or one of its nodes. node: "" is the whole dataflow.
-
-    cells: texts in the order of HEADER. state: the word that a colour stands for.
-    """
+    """One line of the table: a dataflow, or one of its nodes."""
 
     uuid: str
     name: str
-    node: str
-    state: str
-    cells: Sequence[str]
+    node: str  # "" is the whole dataflow
+    state: str  # the word that a colour stands for
+    cells: Sequence[str]  # texts in the order of HEADER
 
     @property
     def key(self) -> tuple[str, str]:

@@ -28,13 +28,10 @@ def period_of(limits: Iterable[int]) -> int:
 
 
 class Clock(NamedTuple):
-    """CLOCK_MONOTONIC without the time that was lost. All in µs.
+    """CLOCK_MONOTONIC without the time that was lost. All in µs."""
 
-    period: of the looks. seen: the last time at which the runner ran for sure.
-    """
-
-    period: int
-    seen: int
+    period: int  # of the looks
+    seen: int  # the last time at which the runner ran for sure
     lost: int = 0
 
     @property
@@ -73,15 +70,12 @@ class Act(Enum):
 
 
 class Watch(NamedTuple):
-    """The watch over one process of a node in one phase. Times are those of Clock.now.
-
-    since: its last sign, or when the watch began. aborted: when it was sent SIGABRT, or None.
-    """
+    """The watch over one process of a node in one phase. Times are those of Clock.now."""
 
     phase: Phase = Phase.AWAY
     pid: int = 0
-    since: int = 0
-    aborted: int | None = None
+    since: int = 0  # its last sign, or when the watch began
+    aborted: int | None = None  # when it was sent SIGABRT, or None
     is_killed: bool = False
 
     @property

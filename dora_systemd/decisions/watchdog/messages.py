@@ -44,15 +44,11 @@ def _clean(value: bytes) -> str:
 
 
 class Sign(NamedTuple):
-    """What one node has said of itself.
+    """What one node has said of itself."""
 
-    status: the text of STATUS=, or "". at_us: CLOCK_MONOTONIC µs of its last WATCHDOG=1, 0: none.
-    watchdog: µs, 0 without one.
-    """
-
-    status: str = ""
-    at_us: int = 0
-    watchdog: int = 0
+    status: str = ""  # the text of STATUS=, or ""
+    at_us: int = 0  # CLOCK_MONOTONIC µs of its last WATCHDOG=1, 0: none
+    watchdog: int = 0  # µs, 0 without one
 
 
 def parse_sign(raw: Any) -> Sign:

@@ -20,19 +20,14 @@ _HOW = {"node-watchdog": "hung, ", WAITING: "waits for "}
 
 
 class Fault(NamedTuple):
-    """Why a release has failed its trial. node: the first that failed, or "".
-
-    is_stop: somebody has stopped the dataflow, so nothing is started in its place. is_outside: the
-    trial could not go on, whatever the release is like. invocation: of systemd, the life in which
-    it was. lines: the last ones of the node, or of all nodes, oldest first.
-    """
+    """Why a release has failed its trial."""
 
     reason: str
-    node: str = ""
-    is_stop: bool = False
-    is_outside: bool = False
-    invocation: str = ""
-    lines: tuple[str, ...] = ()
+    node: str = ""  # the first that failed, or ""
+    is_stop: bool = False  # somebody has stopped the dataflow, so nothing is started in its place
+    is_outside: bool = False  # the trial could not go on, whatever the release is like
+    invocation: str = ""  # of systemd, the life in which it was
+    lines: tuple[str, ...] = ()  # the last ones of the node, or of all nodes, oldest first
 
     @property
     def is_verdict(self) -> bool:

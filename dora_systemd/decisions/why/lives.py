@@ -42,17 +42,15 @@ _SYSTEMD_FIELDS = ("EXIT_CODE", "EXIT_STATUS", "COMMAND", "UNIT_RESULT", "N_REST
 
 @dataclass(frozen=True)
 class Happening:
-    """One record. at_us: CLOCK_REALTIME µs. name: DORA_EVENT, or one of UNIT_MESSAGES.
+    """One record."""
 
-    details: DORA_* without that prefix, and systemd's own fields, in lower case.
-    """
-
-    name: str
-    at_us: int = 0
+    name: str  # DORA_EVENT, or one of UNIT_MESSAGES
+    at_us: int = 0  # CLOCK_REALTIME µs
     node: str = ""
     text: str = ""
     invocation: str = ""
     boot: str = ""
+    # DORA_* without that prefix, and systemd's own fields, in lower case
     details: Mapping[str, str] = field(default_factory=dict)
 
     def detail(self, key: str) -> str:

@@ -61,23 +61,19 @@ class Subject:
 
 @dataclass(frozen=True)
 class Report:
-    """The output of `doractl why`. words: the last lines, of verdict.node or of all nodes.
-
-    inhibitors: who inhibits a restart now. is_held: verdict.node waits for a hot reload. machines:
-    the other ones by name, each with its host, or "" if that is not known. undone: the last change
-    in the history of releases, if it was no new release. is_of_trial: words are of the trial that
-    has failed, in which `undone` ended.
-    """
+    """The output of `doractl why`."""
 
     subject: Subject
     verdict: Verdict
-    words: tuple[Word, ...] = ()
+    words: tuple[Word, ...] = ()  # the last lines, of verdict.node or of all nodes
     budget: Mapping[str, int | None] | None = None
-    inhibitors: tuple[Holder, ...] = ()
-    is_held: bool = False
+    inhibitors: tuple[Holder, ...] = ()  # who inhibits a restart now
+    is_held: bool = False  # verdict.node waits for a hot reload
+    # the other ones by name, each with its host, or "" if that is not known
     machines: Mapping[str, str] = field(default_factory=dict)
+    # the last change in the history of releases, if it was no new release
     undone: Switch | None = None
-    is_of_trial: bool = False
+    is_of_trial: bool = False  # words are of the trial that has failed, in which `undone` ended
 
     @property
     def node(self) -> str:

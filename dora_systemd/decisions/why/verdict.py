@@ -11,27 +11,21 @@ from dora_systemd.decisions.why.lives import Happening
 
 @dataclass(frozen=True)
 class Facts:
-    """The current state from systemd and the runner, in addition to the journal.
+    """The current state from systemd and the runner, in addition to the journal."""
 
-    status: a word of `list`. text: STATUS=. failed: nodes that have failed for good. restarting:
-    nodes that wait for a restart. now_boot: id of this boot. restarts: NRestarts= of the unit, None
-    if systemd has unloaded it. silent: nodes of which an owed output is missing, and which.
-    is_held: whether systemd has not begun the start that it has in its queue. is_gathering: whether
-    it waits for another machine. stopped: nodes that somebody has stopped, and who. policy: its
-    restart policy, "" if that is not known.
-    """
-
-    status: str = ""
-    text: str = ""
-    failed: Mapping[str, str] = field(default_factory=dict)
-    restarting: tuple[str, ...] = ()
-    now_boot: str = ""
-    restarts: int | None = None
+    status: str = ""  # a word of `list`
+    text: str = ""  # STATUS=
+    failed: Mapping[str, str] = field(default_factory=dict)  # nodes that have failed for good
+    restarting: tuple[str, ...] = ()  # nodes that wait for a restart
+    now_boot: str = ""  # id of this boot
+    restarts: int | None = None  # NRestarts= of the unit, None if systemd has unloaded it
+    # nodes of which an owed output is missing, and which
     silent: Mapping[str, str] = field(default_factory=dict)
-    is_held: bool = False
-    is_gathering: bool = False
+    is_held: bool = False  # whether systemd has not begun the start that it has in its queue
+    is_gathering: bool = False  # whether it waits for another machine
+    # nodes that somebody has stopped, and who
     stopped: Mapping[str, str] = field(default_factory=dict)
-    policy: str = ""
+    policy: str = ""  # its restart policy, "" if that is not known
 
 
 @dataclass(frozen=True)
@@ -46,40 +40,33 @@ class Restart:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What happened to a dataflow.
+    """What happened to a dataflow."""
 
-    status: a word of `list`. summary: what ended and how. now: STATUS= of a running one. node: the
-    node that failed first, or "". others: those that failed by themselves after it. at_us: time of
-    that; began_us, ready_us: beginning of that life, and when all nodes were ready; CLOCK_REALTIME
-    µs, 0: unknown. invocation: systemd's id of that life. details: other facts about the end.
-    is_given_up: systemd's start limit is reached. is_passing: dora restarts the node. starved:
-    nodes downstream. restarts: those that `list` counts, oldest first. before: how the life before
-    these ended, and when. nodes: of a dataflow that has ended, as its events name them. stopped:
-    nodes of one that is up which somebody has stopped, and who. policy: see Facts.
-    """
-
-    status: str
+    status: str  # a word of `list`
     cause: Cause = Cause.NONE
-    summary: str = ""
-    now: str = ""
-    node: str = ""
+    summary: str = ""  # what ended and how
+    now: str = ""  # STATUS= of a running one
+    node: str = ""  # the node that failed first, or ""
+    # at_us: time of the failure. began_us, ready_us: beginning of that life, and when all nodes
+    # were ready. CLOCK_REALTIME µs, 0: unknown.
     at_us: int = 0
     began_us: int = 0
     ready_us: int = 0
-    invocation: str = ""
+    invocation: str = ""  # systemd's id of that life
     stopped_by: str = ""
-    is_given_up: bool = False
-    is_passing: bool = False
-    details: Mapping[str, str] = field(default_factory=dict)
-    starved: tuple[str, ...] = ()
-    restarts: tuple[Restart, ...] = ()
+    is_given_up: bool = False  # systemd's start limit is reached
+    is_passing: bool = False  # dora restarts the node
+    details: Mapping[str, str] = field(default_factory=dict)  # other facts about the end
+    starved: tuple[str, ...] = ()  # nodes downstream
+    restarts: tuple[Restart, ...] = ()  # those that `list` counts, oldest first
     timeline: tuple[Happening, ...] = ()
-    before: str = ""
+    before: str = ""  # how the life before these ended, and when
     before_us: int = 0
-    nodes: tuple[NodeRow, ...] = ()
+    nodes: tuple[NodeRow, ...] = ()  # of a dataflow that has ended, as its events name them
+    # nodes of one that is up which somebody has stopped, and who
     stopped: Mapping[str, str] = field(default_factory=dict)
-    policy: str = ""
-    others: tuple[str, ...] = ()
+    policy: str = ""  # see Facts
+    others: tuple[str, ...] = ()  # nodes that failed by themselves after `node`
 
     @property
     def is_up(self) -> bool:
