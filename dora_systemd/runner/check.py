@@ -14,7 +14,7 @@ from dora_systemd.adapters.dora.preparation import Prepared, prepare
 from dora_systemd.decisions.cell.launch import python_of
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
-from dora_systemd.decisions.releases.versions import format_versions
+from dora_systemd.decisions.releases.program_versions import format_versions
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.begin import nodes_environment
 from dora_systemd.runner.nodes.rights import check_first

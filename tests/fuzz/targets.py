@@ -55,8 +55,8 @@ from dora_systemd.decisions.releases.parcel import (
     parse_parcel,
     parse_wants,
 )
+from dora_systemd.decisions.releases.program_versions import parse_versions
 from dora_systemd.decisions.releases.progress import soaking
-from dora_systemd.decisions.releases.versions import parse_versions
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.decisions.why.lives import find_lives, parse_happening

@@ -49,7 +49,11 @@ KEPT = (
     Kept("", r"-> .*time\.monotonic\(\) (<|>)= ", "no clock shows that moment"),
     Kept("adapters/logs/pipes", r"\.drained = 1$", "one byte of DRAIN_LIMIT"),
     Kept("adapters/logs/queue", r"max\(len\(stopped\), 2\)", "one lane has no other turn"),
-    Kept("decisions/logs/events", r"EventKind\(", "the table is made before there is a mutant"),
+    Kept(
+        "decisions/logs/journal_events",
+        r"EventKind\(",
+        "the table is made before there is a mutant",
+    ),
     Kept("decisions/logs/terminal", r"times >= 1:", "once is no repetition, see repeated()"),
     Kept("", r"too_many\(None\)", "the project has no path, as ''"),
     Kept("verbs/releases/build", r"in range\(len\(parts\)\)", "no file has the path ''"),

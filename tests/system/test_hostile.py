@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, wait_for

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 from tests.system.terminal import shown

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.journal_events import EVENTS
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.terminal import shown

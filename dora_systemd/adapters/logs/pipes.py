@@ -22,8 +22,8 @@ from dora_systemd.adapters.logs.held import HeldLines, held_path, read_held
 from dora_systemd.adapters.logs.queue import Journal, LogQueue
 from dora_systemd.adapters.logs.source import CHUNK, PIPE_SIZE, OnLine, Pipe, Source, fifos
 from dora_systemd.decisions.cell.line_rates import LineLimiter, RateLimit, format_rate
-from dora_systemd.decisions.logs.events import event_fields
 from dora_systemd.decisions.logs.fields import Value, encode_entry
+from dora_systemd.decisions.logs.journal_events import event_fields
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin, dora_log_fields
 from dora_systemd.decisions.logs.noise import is_end_of
 from dora_systemd.decisions.resources.usage import WHOLE_CELL, LineCount
@@ -152,7 +152,7 @@ class LogPipes:
             source.drained = 0
 
     def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
-        """Write life event `name` of decisions/logs/events.py after the lines queued before it."""
+        """Write the event `name` of logs/journal_events.py after the lines that are queued."""
         if name == "lines-lost" and isinstance(lost := details["count"], int):
             self._lost += lost
         if node and name == "node-asked":

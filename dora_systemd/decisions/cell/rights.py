@@ -255,15 +255,14 @@ def _words(one: NodeRights, rights: Sequence[NodeRights], base: Base) -> list[st
 
 
 def _limits(one: NodeRights, rights: Sequence[NodeRights]) -> list[str]:
-    own = {"rtprio": one.priority, "nice": NICE_LIMIT - (one.nice or 0) if _favours(one) else 0}
+    own = {
+        "rtprio": one.priority,
+        "nice": NICE_LIMIT - (one.nice or 0) if is_negative(one.nice or 0) else 0,
+    }
     kept = {name: own[name] for name in limits_of_others(rights)}
     words = [f"--{name}={number}:{number}" for name, number in kept.items()]
     words += ["--memlock=unlimited:unlimited"] if one.lock_memory else []
     return _program("prlimit", *words) if words else []
-
-
-def _favours(one: NodeRights) -> bool:
-    return is_negative(one.nice or 0)
 
 
 def _oom(one: NodeRights, rights: Sequence[NodeRights], base: Base) -> list[str]:

@@ -82,7 +82,7 @@ def name_input(reason: str, document: Any) -> str:
     found = [
         f"{shown(str(key)[:_LONGEST])}: {trouble}"
         for key, value in inputs.items()
-        if (trouble := _trouble_of(value))
+        if (trouble := next(_troubles(value), ""))
     ]
     told = found[0] if found else "it is not NODE/OUTPUT, a timer, or a mapping with a source"
     place = f"nodes[{match[1]}].inputs{'.' if found else ': '}"
@@ -94,11 +94,6 @@ def _inputs(document: Any, place: int) -> Mapping[Any, Any]:
     node = nodes[place] if isinstance(nodes, list) and place < len(nodes) else None
     inputs = node.get("inputs") if isinstance(node, Mapping) else None
     return inputs if isinstance(inputs, Mapping) else {}
-
-
-def _trouble_of(value: Any) -> str:
-    """Why dora cannot read the value of an input, or ""."""
-    return next(_troubles(value), "")
 
 
 def _troubles(value: Any) -> Iterator[str]:

@@ -61,7 +61,7 @@ class Do(Enum):
 
 @dataclass(frozen=True)
 class Record:
-    """Action: write a life event of decisions/logs/events.py. node: "" for the dataflow."""
+    """Action: write a life event of decisions/logs/journal_events.py. node: "" for the dataflow."""
 
     event: str
     node: str = ""

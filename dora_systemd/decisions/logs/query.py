@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dora_systemd.decisions.logs.events import EVENTS, REQUESTS
+from dora_systemd.decisions.logs.journal_events import EVENTS, REQUESTS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, unit_name
 from dora_systemd.scope import Scope

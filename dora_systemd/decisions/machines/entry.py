@@ -152,7 +152,7 @@ _ANY = re.compile(r"^machines[ \t]*:", re.MULTILINE)
 
 def with_machine(text: str, name: str, host: str) -> str | None:
     """The text with one more machine; None if `machines:` has a form that is not for lines."""
-    entry = f"  {name}: {{host: {_scalar(host)}}}\n"
+    entry = f'  {name}: {{host: "{host}"}}\n'  # no host has a quote
     found = _KEY.search(text)
     if found:
         end = found.end() + 1
@@ -181,8 +181,3 @@ def _indented(after: str, entry: str) -> str:
     """The entry as far to the right as those that are there."""
     first = re.match(r"([ ]+)\S", after)
     return f"{first[1] if first else '  '}{entry.lstrip()}"
-
-
-def _scalar(text: str) -> str:
-    """As YAML reads it back: no host has a quote."""
-    return f'"{text}"'

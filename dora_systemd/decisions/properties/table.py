@@ -14,7 +14,7 @@ keys, each with a good value and four bad ones:
 - All users see its command line. In a user's manager, nobody else sees Environment= otherwise.
   One argument has at most 128 KiB.
 - A start takes 30 ms instead of 11 ms (medians of 20, on a busy machine).
-- systemd 252 refuses newer keys, which `unit/versions.py` leaves out with a warning.
+- systemd 252 refuses newer keys, which `unit/systemd_versions.py` leaves out with a warning.
 - `enable` compares values: 90s is 1min 30s.
 """
 

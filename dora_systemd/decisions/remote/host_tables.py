@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dora_systemd.decisions.releases.versions import PROGRAMS
+from dora_systemd.decisions.releases.program_versions import PROGRAMS
 from dora_systemd.decisions.views.dataflows import UNREACHABLE, dataflow_table, format_table
 from dora_systemd.decisions.views.formats import UNKNOWN, local_time
 from dora_systemd.decisions.views.releases import HEADER as RELEASES

@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from dora_systemd.decisions.unit.versions import MIN_VERSION, lacking
+from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, lacking
 from dora_systemd.decisions.views.findings import Finding, State, assigned
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import format_duration, parse_duration

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, UNPROVED, Switch
+from dora_systemd.decisions.releases.program_versions import PROGRAMS
 from dora_systemd.decisions.releases.progress import COPY, SOAK, Step
-from dora_systemd.decisions.releases.versions import PROGRAMS
 from dora_systemd.decisions.views.dataflows import format_table
 from dora_systemd.decisions.views.formats import UNKNOWN, local_time
 from dora_systemd.decisions.views.objects import moment

@@ -54,12 +54,12 @@ class Sign(NamedTuple):
 def parse_sign(raw: Any) -> Sign:
     """A sign in a table that the nodes' user can write; what is none becomes an empty one."""
     match raw:
-        case [str() as status, int() as at_us, int() as watchdog] if _is_time(at_us, watchdog):
+        case [str() as status, int() as at_us, int() as watchdog] if _are_times(at_us, watchdog):
             return Sign(status[:MAX_STATUS], at_us, watchdog)
     return Sign()
 
 
-def _is_time(*numbers: int) -> bool:
+def _are_times(*numbers: int) -> bool:
     return all(type(one) is int and 0 <= one < INFINITY // 2 for one in numbers)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.decisions.why.lives import Happening
 
 WAITING = "node-waiting"

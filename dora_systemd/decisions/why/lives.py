@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dora_systemd.decisions.cell.status import STOP
-from dora_systemd.decisions.logs.events import REQUESTS
+from dora_systemd.decisions.logs.journal_events import REQUESTS
 from dora_systemd.decisions.logs.query import UNIT_FAILED, UNIT_STARTING
 from dora_systemd.decisions.views.facts import NodeRow
 

@@ -12,7 +12,7 @@ from dora_systemd.decisions.cell.owes import STARVED
 from dora_systemd.decisions.cell.status import RESTART
 from dora_systemd.decisions.life.causes import ESSENTIAL, NO_END, UNIT_RESULTS, Cause, result_words
 from dora_systemd.decisions.life.refusal import setup_failure
-from dora_systemd.decisions.logs.events import NODE_END_EVENTS
+from dora_systemd.decisions.logs.journal_events import NODE_END_EVENTS
 from dora_systemd.decisions.reload.changes import How
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.watchdog.judge import by_watchdog

@@ -8,7 +8,7 @@ from typing import Any
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.cell.status import format_stopped
-from dora_systemd.decisions.logs.events import BUILD_FAILED, ROLLED_BACK
+from dora_systemd.decisions.logs.journal_events import BUILD_FAILED, ROLLED_BACK
 from dora_systemd.decisions.releases.past import Switch
 from dora_systemd.decisions.views.dataflows import RESTARTING, colored_state
 from dora_systemd.decisions.views.formats import UNKNOWN, local_time, zoned_time

@@ -28,7 +28,7 @@ from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status, is_up
-from dora_systemd.decisions.logs.events import END_EVENTS, NODE_END_EVENTS
+from dora_systemd.decisions.logs.journal_events import END_EVENTS, NODE_END_EVENTS
 from dora_systemd.decisions.resources.usage import CpuSample, add_sample
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths

@@ -13,7 +13,7 @@ from dora_systemd.adapters.journal.reader import (
     later_failures,
 )
 from dora_systemd.decisions.life.causes import NO_END
-from dora_systemd.decisions.logs.events import FORGOTTEN
+from dora_systemd.decisions.logs.journal_events import FORGOTTEN
 from dora_systemd.decisions.logs.query import request_matches
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow

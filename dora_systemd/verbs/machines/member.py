@@ -35,7 +35,7 @@ from dora_systemd.decisions.machines.wire import (
     format_message,
     parse_message,
 )
-from dora_systemd.decisions.unit.versions import transient_commands
+from dora_systemd.decisions.unit.systemd_versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope

@@ -22,7 +22,7 @@ from dora_systemd.adapters.releases.draft import BuildTree
 from dora_systemd.adapters.releases.store import Store, remove_tree
 from dora_systemd.decisions.cell.options import build_command
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
-from dora_systemd.decisions.logs.events import BUILD_FAILED
+from dora_systemd.decisions.logs.journal_events import BUILD_FAILED
 from dora_systemd.decisions.releases.build import (
     BuildTask,
     build_environment,

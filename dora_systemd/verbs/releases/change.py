@@ -18,7 +18,7 @@ from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.logs.journal_events import ROLLED_BACK
 from dora_systemd.decisions.releases.progress import Step, going_back, judged, stopping, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.releases.store import Store, locked
-from dora_systemd.decisions.logs.events import FORGOTTEN
+from dora_systemd.decisions.logs.journal_events import FORGOTTEN
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean, unit_name
 from dora_systemd.scope import Scope

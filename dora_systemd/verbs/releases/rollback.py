@@ -5,7 +5,7 @@ from functools import partial
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.releases.store import Store, locked
-from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.logs.journal_events import ROLLED_BACK
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import before
 from dora_systemd.decisions.releases.progress import checking, waiting

@@ -19,7 +19,7 @@ from dora_systemd.decisions.cell.options import check_command
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.properties.kinds import Property
-from dora_systemd.decisions.releases.versions import parse_versions
+from dora_systemd.decisions.releases.program_versions import parse_versions
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.programs import own_account
 from dora_systemd.values import SECOND, shown

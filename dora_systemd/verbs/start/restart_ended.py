@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.logs.events import FORGOTTEN
+from dora_systemd.decisions.logs.journal_events import FORGOTTEN
 from dora_systemd.decisions.logs.query import request_matches
 from dora_systemd.decisions.settings.resolve import given_texts, is_given
 from dora_systemd.errors import DoraSystemdError, ExitCode

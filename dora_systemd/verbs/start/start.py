@@ -17,7 +17,7 @@ from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.settings.table import USER
 from dora_systemd.decisions.unit.file import persistent_unit, says_the_same, user_of
 from dora_systemd.decisions.unit.properties import format_unit
-from dora_systemd.decisions.unit.versions import drop_unsupported
+from dora_systemd.decisions.unit.systemd_versions import drop_unsupported
 from dora_systemd.decisions.views.formats import local_time
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -23,7 +23,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.needs.units import format_awaited, own_units
 from dora_systemd.decisions.needs.waiting import START, format_wait
-from dora_systemd.decisions.unit.versions import transient_commands
+from dora_systemd.decisions.unit.systemd_versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope

@@ -15,7 +15,7 @@ from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.resolve import idle_warnings
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
-from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
+from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, drop_unsupported
 from dora_systemd.paths import CellPaths
 from dora_systemd.trust.paths import exists
 from dora_systemd.values import quoted

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.decisions.logs.events import FORGOTTEN
+from dora_systemd.decisions.logs.journal_events import FORGOTTEN
 from tests.unit.fakes.libraries import install
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.fakes.programs import make_program

@@ -10,7 +10,7 @@ import pytest
 from dora_systemd import __version__
 from dora_systemd.adapters.releases.store import store_root
 from dora_systemd.decisions.unit.file import HEADER
-from dora_systemd.decisions.unit.versions import MIN_VERSION
+from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION
 from dora_systemd.names import SLICE
 from dora_systemd.verbs.start.account import DEFAULT_USER
 from tests.unit.checkout import CHECKOUT

@@ -14,7 +14,7 @@ from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, Runne
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.table import TABLE, step
 from dora_systemd.decisions.life.view import is_up
-from dora_systemd.decisions.logs.events import END_EVENTS
+from dora_systemd.decisions.logs.journal_events import END_EVENTS
 from dora_systemd.values import SECOND
 
 SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {

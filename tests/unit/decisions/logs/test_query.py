@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.logs.events import EVENTS, REQUESTS
+from dora_systemd.decisions.logs.journal_events import EVENTS, REQUESTS
 from dora_systemd.decisions.logs.query import (
     UNIT_FAILED,
     UNIT_STARTING,

@@ -17,7 +17,7 @@ from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS, Sandbox,
 from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
-from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
+from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, drop_unsupported
 from dora_systemd.decisions.why.remedies import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope

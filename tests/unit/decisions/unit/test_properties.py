@@ -14,7 +14,7 @@ from dora_systemd.decisions.settings.kinds import TEXT, Kind, Setting
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
-from dora_systemd.decisions.unit.versions import MIN_VERSION, transient_commands
+from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, format_size, parse_size
 from tests.unit.checkout import CHECKOUT

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.logs.events import ROLLED_BACK as BACK_EVENT
+from dora_systemd.decisions.logs.journal_events import ROLLED_BACK as BACK_EVENT
 from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, Switch
 from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.decisions.why.last_lines import Word

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.decisions.views.dataflows import format_dataflows
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.why.report import format_report

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.releases.store import Store
-from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.decisions.releases.progress import Step
 from dora_systemd.decisions.unit.file import with_boot_check
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -4,7 +4,7 @@ import pytest
 
 from dora_systemd.decisions.properties.assignments import parse_property
 from dora_systemd.decisions.properties.kinds import Property
-from dora_systemd.decisions.unit.versions import drop_unsupported, transient_commands
+from dora_systemd.decisions.unit.systemd_versions import drop_unsupported, transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from dora_systemd.decisions.logs.events import END_EVENTS, EVENTS, event_fields
+from dora_systemd.decisions.logs.journal_events import END_EVENTS, EVENTS, event_fields
 from tests.unit.checkout import CHECKOUT
 
 CATALOG = CHECKOUT / "units/templates/dora-systemd.catalog"

@@ -3,7 +3,7 @@
 import pytest
 
 from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
-from dora_systemd.decisions.releases.versions import format_versions, parse_versions
+from dora_systemd.decisions.releases.program_versions import format_versions, parse_versions
 from dora_systemd.decisions.views.releases import ReleaseRow, format_releases, release_object
 from dora_systemd.errors import DoraSystemdError
 
