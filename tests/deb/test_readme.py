@@ -1,4 +1,4 @@
-"""README.md and docs/first-steps.md, typed on a machine with the packages, by a person in a shell.
+"""README.md and pages of docs/, typed on a machine with the packages, by a person in a shell.
 
 Every line that begins with "$ " is typed; what it prints is compared with what stands below it.
 """
@@ -19,6 +19,9 @@ NO_MEMORY = not Path("/sys/fs/cgroup/cgroup.controllers").read_text().count("mem
 """Containers whose kernel has memory in cgroup v1 refuse a limit, as doractl should."""
 KEYS = {"doractl top": ("plot", b"q"), "doractl run": ("frame ", b"\x03")}
 """Commands that wait for a key: when to press it, and which."""
+FROM_NOTHING = ("README.md", "docs/first-steps.md")
+WITH_ROBOT = ("docs/run-at-boot.md",)
+"""Pages about a robot that is already in PLACE."""
 PLACE = Path("/srv/robot")
 EXAMPLE = Path("/usr/share/doc/dora-systemd/examples/robot")
 
@@ -53,9 +56,12 @@ def shell(installed: None) -> Iterator[Shell]:
     sh(f"rm -rf {PLACE}")
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/first-steps.md"])
+@pytest.mark.parametrize("page", [*FROM_NOTHING, *WITH_ROBOT])
 def test_it_prints_what_stands_there(shell: Shell, page: str) -> None:
     wrong = []
+    if page in WITH_ROBOT:
+        shutil.copytree(EXAMPLE, PLACE)
+        packages.make_venv(PLACE / ".venv")
     for typed in lines_of(page):
         if "pip install" in typed.line:
             # The lab's machines reach no index; theirs is the same, from the image.
