@@ -1,7 +1,7 @@
 """The dora of the first run boots in a thread, while the rest of the runner is imported."""
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
@@ -19,18 +19,24 @@ and the checks need not wait for a coordinator that hangs."""
 class EarlyDaemon:
     """Enables the controllers for the nodes, and starts the daemon once the coordinator listens.
 
-    unit: cgroup directory. environment: of the nodes.
+    unit: cgroup directory. environment: of the nodes. token, more: as of start_daemon().
     """
 
     def __init__(
-        self, options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
+        self,
+        options: RunnerOptions,
+        paths: CellPaths,
+        unit: Path,
+        environment: Mapping[str, str],
+        token: str = "",
+        more: Sequence[str] = (),
     ) -> None:
         self._dora, self._paths, self._unit = options.dora, paths, unit
         self._environment = {
             **environment,
             **daemon_variables(options, paths, unit, environment),
         }
-        self._port = 0
+        self._port, self._token, self._more = 0, token, more
         self._work = beside(self._start_daemon)
 
     def _start_daemon(self) -> Daemon | None:
@@ -48,7 +54,8 @@ class EarlyDaemon:
         raise NotImplementedError
 
     def _spawn_daemon(self) -> Daemon:
-        return start_daemon(self._dora, self._paths, self._port, self._environment)
+        given = (self._dora, self._paths, self._port, self._environment)
+        return start_daemon(*given, self._token, self._more)
 
     def daemon(self) -> Daemon | None:
         """Wait for the daemon to be started; None if it is not, or not yet."""
@@ -56,7 +63,7 @@ class EarlyDaemon:
 
 
 class Boot(EarlyDaemon):
-    """The same with the coordinator, which has been started."""
+    """EarlyDaemon of a machine whose coordinator has been started."""
 
     def __init__(
         self,
@@ -65,9 +72,10 @@ class Boot(EarlyDaemon):
         paths: CellPaths,
         unit: Path,
         environment: Mapping[str, str],
+        more: Sequence[str] = (),
     ) -> None:
         self.coordinator = coordinator
-        super().__init__(options, paths, unit, environment)
+        super().__init__(options, paths, unit, environment, more=more)
 
     def _find_port(self) -> int:
         return engine.read_port(self.coordinator, LISTEN_SECONDS)

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -33,7 +33,9 @@ OnRecord = Callable[[protocol.LogRecord], None]
 class Engine:
     """The coordinator and daemon of a cell, and requests to them.
 
-    environment: that of the nodes, without systemd's own variables. boot: of the first run.
+    environment: that of the nodes, without systemd's own variables. boot: of the first run. port:
+    of the coordinator, 0 for any. more: arguments of the daemon. on_token: takes the token of the
+    coordinator, once that listens.
     """
 
     def __init__(
@@ -42,8 +44,12 @@ class Engine:
         paths: CellPaths,
         environment: Mapping[str, str],
         boot: EarlyDaemon | None = None,
+        port: int = 0,
+        more: Sequence[str] = (),
+        on_token: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._boot = boot
+        self._wanted_port, self._more, self._on_token = port, more, on_token
         self._dora = dora
         self._paths = paths
         self._environment = dict(environment)
@@ -59,19 +65,17 @@ class Engine:
         Raises as start_coordinator() does.
         """
         boot = self._boot if isinstance(self._boot, Boot) else None
-        child = boot.coordinator if boot else self._spawn_coordinator()
+        child = boot.coordinator if boot else None
+        if child is None:
+            given = (self._dora, self._paths, self._environment)
+            child = start_coordinator(*given, self._wanted_port)
         self._children[child.label] = child
         return child
-
-    def _spawn_coordinator(self) -> engine.Child:
-        return start_coordinator(self._dora, self._paths, self._environment)
-
-    def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        return start_daemon(self._dora, self._paths, self._port, environment)
 
     def set_port(self, port: int) -> None:
         """Set the port of the coordinator, which has written its token by now. Raises OSError."""
         self._port, self._token = port, read_token(self._paths)
+        self._on_token(self._token)
 
     def start_daemon(self, added: Mapping[str, str]) -> engine.Child:
         """Start the daemon with `added` variables, unless it boots already; write the control file.
@@ -80,7 +84,8 @@ class Engine:
         """
         daemon = self._boot.daemon() if self._boot else None
         if daemon is None:
-            daemon = self._spawn_daemon({**self._environment, **added})
+            given = (self._dora, self._paths, self._port, {**self._environment, **added})
+            daemon = start_daemon(*given, self._token, self._more)
         self._children[daemon.child.label] = daemon.child
         self._write_access(daemon)
         return daemon.child

@@ -36,8 +36,18 @@ from dora_systemd.decisions.machines.wire import (
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
+from dora_systemd.runner.cell.begin import start_coordinator
 from dora_systemd.runner.cell.boot import Boot, EarlyDaemon
+
+GREETED = "greeted"
+"""A key of a request for a session that has got its ports already."""
+_FD = struct.Struct("i")
+_ZENOH = Path(__file__).parents[2] / "zenoh-machines.json5"
+_NO_DIRECT = {"DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS": "0"}
+"""Where ssh carries the messages, nodes of different machines do not dial each other: the addresses
+would be those of 127.0.0.1. So dora must not wait for them either; it would for 1.5 s."""
+_OVERLAYS = ("ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY")
+"""Variables by which a user sets the same: dora refuses both."""
 
 
 def choose_ports(
@@ -60,14 +70,6 @@ def choose_ports(
     except StopIteration:
         message = f"cannot find free ports from {ports[0]} to {ports[-1]}"
         raise DoraSystemdError(message, "see: ss -ltn") from None
-
-
-_ZENOH = Path(__file__).parents[2] / "zenoh-machines.json5"
-_NO_DIRECT = {"DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS": "0"}
-"""Where ssh carries the messages, nodes of different machines do not dial each other: the addresses
-would be those of 127.0.0.1. So dora must not wait for them either; it would for 1.5 s."""
-_OVERLAYS = ("ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY")
-"""Variables by which a user sets the same: dora refuses both."""
 
 
 def shared_environment(environment: Mapping[str, str], addresses: Sequence[str]) -> dict[str, str]:
@@ -97,10 +99,6 @@ def _arguments(
     return ("--zenoh-listen", endpoint([*addresses, LOOPBACK][0], port), *overlay)
 
 
-GREETED = "greeted"
-"""A key of a request for a session that has got its ports already."""
-
-
 class HeadBoot(Boot):
     """The dora of a head, on ports that all machines know. door: tells them the links."""
 
@@ -108,7 +106,6 @@ class HeadBoot(Boot):
         self, options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
     ) -> None:
         members = members_of(options.placed)
-        self._addresses = options.addresses
         self.ports = choose_ports(members, options.addresses)
         told = forwards(options, self.ports)
         self.door = Door(paths.socket, lambda line: greeting(line, members, told))
@@ -118,11 +115,8 @@ class HeadBoot(Boot):
         except (OSError, DoraSystemdError):
             self.door.close()
             raise
-        super().__init__(coordinator, options, paths, unit, own)
-
-    def _spawn_daemon(self) -> Daemon:
-        more = head_arguments(self.ports, self._environment, self._addresses)
-        return start_daemon(self._dora, self._paths, self._port, self._environment, more=more)
+        more = head_arguments(self.ports, own, options.addresses)
+        super().__init__(coordinator, options, paths, unit, own, more)
 
 
 def forwards(options: RunnerOptions, ports: Forwards) -> Forwards:
@@ -142,9 +136,6 @@ def greeting(line: bytes, members: tuple[str, ...], ports: Forwards) -> tuple[by
     return format_message(ports), json.dumps({**request, GREETED: True}).encode()
 
 
-_FD = struct.Struct("i")
-
-
 class MemberBoot(EarlyDaemon):
     """The daemon of a member. part: what its head has said. rest: what it has said since.
 
@@ -162,17 +153,12 @@ class MemberBoot(EarlyDaemon):
             if (self.part.name, self.part.machine) != (options.name, options.machine):
                 raise no_head()
             undo.pop_all()
-        self._addresses = options.addresses
         own = shared_environment(environment, options.addresses)
-        super().__init__(own_options(options), paths, unit, own)
+        more = member_arguments(self.part, own, options.addresses)
+        super().__init__(own_options(options), paths, unit, own, self.part.token, more)
 
     def _find_port(self) -> int:
         return self.part.coordinator
-
-    def _spawn_daemon(self) -> Daemon:
-        more = member_arguments(self.part, self._environment, self._addresses)
-        given = (self._dora, self._paths, self._port, self._environment)
-        return start_daemon(*given, self.part.token, more)
 
 
 def _said(connection: socket.socket) -> bytes:

@@ -48,9 +48,14 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import SILENCE, Engine
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.cell.restarts import Life, is_transient
-from dora_systemd.runner.machines.boot import HeadBoot, choose_ports
+from dora_systemd.runner.machines.boot import (
+    HeadBoot,
+    choose_ports,
+    head_arguments,
+    shared_environment,
+)
 from dora_systemd.runner.machines.roster import Roster, find_unreached
-from dora_systemd.runner.machines.shared import NOISE, HeadEngine, Shared, end_nodes, read_digests
+from dora_systemd.runner.machines.shared import NOISE, Shared, SharedEngine, end_nodes, read_digests
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
@@ -125,8 +130,10 @@ class Head(Shared):
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
         """A coordinator and a daemon on the ports that all machines know."""
-        told = (self.options.addresses, self._ports, self.roster.set_token)
-        return HeadEngine(dora, paths, environment, *told, boot)
+        addresses, ports = self.options.addresses, self._ports
+        own = shared_environment(environment, addresses)
+        more = head_arguments(ports, own, addresses)
+        return SharedEngine(dora, paths, own, boot, ports.coordinator, more, self.roster.set_token)
 
     def cell(self, cell: Cell) -> Cell:
         """The cell, with the machine of each node."""
@@ -161,20 +168,26 @@ class Head(Shared):
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> Dialogue:
         """Dialogue of a head: waits for all members, and ends nodes without dora if one is lost."""
-        assert isinstance(dora, HeadEngine)
+        assert isinstance(dora, SharedEngine)
         pipes.left_out = NOISE
         self.roster.push, self.roster.refresh = pump.push, pump.refresh
         pump.amend = self.roster.amend
-        dialogue = HeadDialogue(options, pump, dora, nodes, pipes)
-        dialogue.begin(self.roster, dora)
-        return dialogue
+        return HeadDialogue(options, pump, dora, nodes, pipes, self.roster)
 
 
 class HeadDialogue(Dialogue):
-    """Carries out each Do of a head. Call begin() first."""
+    """Carries out each Do of a head."""
 
-    def begin(self, roster: Roster, dora: HeadEngine) -> None:
-        """Set what the actions need."""
+    def __init__(
+        self,
+        options: RunnerOptions,
+        pump: Pump,
+        dora: SharedEngine,
+        nodes: Nodes,
+        pipes: LogPipes,
+        roster: Roster,
+    ) -> None:
+        super().__init__(options, pump, dora, nodes, pipes)
         self._roster, self._dora = roster, dora
         self._ends_at, self._is_ending = 0.0, False
         self._unreached: dict[str, str] = {}
@@ -243,7 +256,7 @@ class HeadDialogue(Dialogue):
                     await self._roster.changed.wait()
 
     def _show_awaited(self) -> None:
-        if (text := self._awaited()) != self._pump.cell.awaited:
+        if (text := f"waiting for {self._named()}") != self._pump.cell.awaited:
             self._pump.push(life.MachinesAwaited(now_us(), text))
 
     async def _has_each(self) -> bool:
@@ -255,9 +268,6 @@ class HeadDialogue(Dialogue):
             found = [machine for machine, _ in await self._dora.heartbeats()]
             return all(found.count(name) == 1 for name in self._roster.names)
         return False
-
-    def _awaited(self) -> str:
-        return f"waiting for {self._named()}"
 
     def _named(self) -> str:
         """The members that are missing, and why."""

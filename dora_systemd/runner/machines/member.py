@@ -43,7 +43,7 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.cell.restarts import Life
-from dora_systemd.runner.machines.boot import MemberBoot, no_head
+from dora_systemd.runner.machines.boot import MemberBoot, no_head, shared_environment
 from dora_systemd.runner.machines.lines import Lines
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
 from dora_systemd.runner.machines.shared import (
@@ -97,11 +97,7 @@ class Uses:
 
 
 class Member(Shared):
-    """A machine that another one has given nodes.
-
-    stops_by_head: the head knows that this part ends. is_answered: the head ends its own part, or
-    is gone. grace: µs that the head leaves the nodes. take_over: gives the connection to the head.
-    """
+    """A machine that another one has given nodes. take_over: gives the connection to the head."""
 
     def __init__(
         self,
@@ -141,8 +137,9 @@ class Member(Shared):
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
         """A daemon for the coordinator of the head."""
-        own, self._environment = self.options, environment
-        self._dora = MemberEngine(dora, paths, environment, own.addresses, own.machine, boot)
+        self._environment = environment
+        own = shared_environment(environment, self.options.addresses)
+        self._dora = MemberEngine(dora, paths, own, boot)
         return self._dora
 
     def start_coordinator(self, dora: Engine) -> None:
@@ -160,8 +157,7 @@ class Member(Shared):
         pipes.left_out = NOISE
         self._pump, pump.amend = pump, partial(self._note_table, Uses(nodes))
         pump.on_event = self._tell_hung
-        dialogue = MemberDialogue(options, pump, dora, nodes, pipes)
-        dialogue.begin(self, dora)
+        dialogue = MemberDialogue(options, pump, dora, nodes, pipes, self)
         self._spawn = dialogue.spawn
         dialogue.spawn("hear the head", self._hear_head())
         dialogue.spawn("tell what its nodes run", self._tell_programs())
@@ -210,7 +206,7 @@ class Member(Shared):
             self._end_by_head(reason)
             return
         assert self._dora is not None
-        self._dora.set_part(part)
+        self._dora.set_part(part, self.options.addresses)
         self._has_head.set()
         self._push(life.CoordinatorListening(now_us()))
         why = await self._lines.talk(self._hear)

@@ -7,7 +7,9 @@ from itertools import chain, repeat
 from typing import Any, Protocol
 
 from dora_systemd.adapters.host.process import run_command
+from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
@@ -34,26 +36,30 @@ _ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
 
 
 class Voice(Protocol):
-    """What talks with the head. stops_by_head: the head knows that this part ends.
+    """What talks with the head."""
 
-    is_answered: the head ends its own part, or is gone. grace: µs that the head leaves the nodes.
-    is_going_down: whether systemd, or that of the user, stops everything.
-    """
-
-    stops_by_head: bool
-    grace: int
-    is_answered: asyncio.Event
-    is_going_down: Callable[[bool], bool]
+    stops_by_head: bool  # the head knows that this part ends
+    grace: int  # µs that the head leaves the nodes
+    is_answered: asyncio.Event  # the head ends its own part, or is gone
+    is_going_down: Callable[[bool], bool]  # whether systemd, or that of the user, stops everything
 
     def send(self, message: wire.Message) -> None:
         """Say something to the head, if it is there."""
 
 
 class MemberDialogue(Dialogue):
-    """Carries out each Do of a member. Call begin() first."""
+    """Carries out each Do of a member."""
 
-    def begin(self, voice: Voice, dora: MemberEngine) -> None:
-        """Set what the actions need."""
+    def __init__(
+        self,
+        options: RunnerOptions,
+        pump: Pump,
+        dora: MemberEngine,
+        nodes: Nodes,
+        pipes: LogPipes,
+        voice: Voice,
+    ) -> None:
+        super().__init__(options, pump, dora, nodes, pipes)
         self._voice, self._dora = voice, dora
         self._has_told = self._is_cut_off = False
 

@@ -5,24 +5,21 @@ import contextlib
 import hashlib
 import os
 import signal
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.machines.part import MOST_FILES, is_here, own_dataflow, own_options
-from dora_systemd.decisions.machines.wire import Forwards, Part
+from dora_systemd.decisions.machines.wire import Part
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
-from dora_systemd.runner.cell.boot import EarlyDaemon
+from dora_systemd.runner.cell.begin import Daemon
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.machine_role import Alone
-from dora_systemd.runner.machines.boot import head_arguments, member_arguments, shared_environment
+from dora_systemd.runner.machines.boot import member_arguments
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.reload.sources import Sources
 from dora_systemd.trust.eyes import read_regular
@@ -58,20 +55,9 @@ NOISE = (
 
 
 class SharedEngine(Engine):
-    """The dora of a head or a member. machine: the name of its daemon, "" on the head."""
+    """The dora of a head or a member."""
 
-    machine = ""
-
-    def __init__(
-        self,
-        dora: str,
-        paths: CellPaths,
-        environment: Mapping[str, str],
-        addresses: Sequence[str],
-        boot: EarlyDaemon | None = None,
-    ) -> None:
-        super().__init__(dora, paths, shared_environment(environment, addresses), boot)
-        self._addresses = addresses
+    machine = ""  # the name of its daemon, "" on the head
 
     async def heartbeats(self) -> list[tuple[str, int]]:
         """The machine of each daemon that is connected, and µs since it was heard.
@@ -94,61 +80,13 @@ class SharedEngine(Engine):
         return any(machine == self.machine for machine, _ in await self.heartbeats())
 
 
-class HeadEngine(SharedEngine):
-    """Coordinator and daemon of the head, on ports that all machines know."""
-
-    def __init__(
-        self,
-        dora: str,
-        paths: CellPaths,
-        environment: Mapping[str, str],
-        addresses: Sequence[str],
-        ports: Forwards,
-        on_access: Callable[[str], None],
-        boot: EarlyDaemon | None = None,
-    ) -> None:
-        super().__init__(dora, paths, environment, addresses, boot)
-        self._ports, self._on_access = ports, on_access
-
-    def _spawn_coordinator(self) -> engine.Child:
-        return start_coordinator(
-            self._dora, self._paths, self._environment, self._ports.coordinator
-        )
-
-    def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        more = head_arguments(self._ports, environment, self._addresses)
-        return start_daemon(self._dora, self._paths, self._port, environment, more=more)
-
-    def set_port(self, port: int) -> None:
-        """Set the port of the coordinator, and tell the members."""
-        super().set_port(port)
-        self._on_access(self._token)
-
-
 class MemberEngine(SharedEngine):
     """The daemon of a member; its coordinator is on the head."""
 
-    _part: Part
-
-    def __init__(
-        self,
-        dora: str,
-        paths: CellPaths,
-        environment: Mapping[str, str],
-        addresses: Sequence[str],
-        machine: str,
-        boot: EarlyDaemon | None = None,
-    ) -> None:
-        super().__init__(dora, paths, environment, addresses, boot)
-        self.machine = machine
-
-    def set_part(self, part: Part) -> None:
-        """Set how to reach the head. That is in memory only."""
-        self._part, self._port, self._token = part, part.coordinator, part.token
-
-    def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        more = member_arguments(self._part, environment, self._addresses)
-        return start_daemon(self._dora, self._paths, self._port, environment, self._token, more)
+    def set_part(self, part: Part, addresses: Sequence[str]) -> None:
+        """Set how to reach the head. That is in memory only. addresses: of the options."""
+        self.machine, self._port, self._token = part.machine, part.coordinator, part.token
+        self._more = member_arguments(part, self._environment, addresses)
 
     def cut_off(self) -> None:
         """Kill the daemon, because its coordinator is gone.

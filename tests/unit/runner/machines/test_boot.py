@@ -21,8 +21,8 @@ from dora_systemd.runner.machines.boot import (
     greeting,
     head_arguments,
     received,
+    shared_environment,
 )
-from dora_systemd.runner.machines.shared import SharedEngine
 from tests.unit.fakes.boots import QuietBoot, standard_input
 from tests.unit.fakes.manager import UUID
 
@@ -113,10 +113,9 @@ def test_a_member_that_nobody_has_started() -> None:
 
 @pytest.mark.parametrize(("addresses", "timeout"), [((), "0"), (("10.99.0.1", "10.99.0.2"), None)])
 def test_nodes_dial_each_other_only_without_ssh(
-    addresses: tuple[str, ...], timeout: str | None, tmp_path: Path
+    addresses: tuple[str, ...], timeout: str | None
 ) -> None:
-    engine = SharedEngine("/bin/dora", CellPaths(tmp_path), {}, addresses)
-    found = engine._environment.get("DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS")
+    found = shared_environment({}, addresses).get("DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS")
     assert found == timeout
     (_, listen, *_) = head_arguments(PORTS, {}, addresses)
     assert listen == f"{addresses[0] if addresses else '127.0.0.1'}:61001"

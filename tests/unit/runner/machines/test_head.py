@@ -24,7 +24,7 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.machines.head import HeadDialogue
 from dora_systemd.runner.machines.roster import Roster
-from dora_systemd.runner.machines.shared import HeadEngine
+from dora_systemd.runner.machines.shared import SharedEngine
 from dora_systemd.values import SECOND
 from tests.unit.fakes.dialogue import Heard
 from tests.unit.fakes.ends import FakeEnds
@@ -69,9 +69,9 @@ class Bench:
         self.pump = Heard(cell, Life("uuid"), CellPaths(root), self.nodes, self.pipes)
         self.pump.heard, self.pump.calls = [], []
         self.roster.push = self.pump.push
-        self.dialogue = HeadDialogue(given, self.pump, self.dora, self.nodes, self.pipes)
+        dora = cast(SharedEngine, self.dora)
         self.roster.is_awaited = is_awaited
-        self.dialogue.begin(self.roster, cast(HeadEngine, self.dora))
+        self.dialogue = HeadDialogue(given, self.pump, dora, self.nodes, self.pipes, self.roster)
         self.actions = self.dialogue.actions({"nodes": []}, {})
 
     @property

@@ -68,7 +68,7 @@ class Bench:
         self.pump = Heard(self.member.cell(cell), Life("uuid"), paths, self.nodes, self.pipes)
         self.pump.heard, self.pump.calls = [], []
         self.member.engine("/bin/dora", paths, {}, None)
-        dora = FakeEngine("/bin/dora", paths, {}, (), OPTIONS.machine)
+        dora = FakeEngine("/bin/dora", paths, {})
         dialogue = self.member.dialogue(OPTIONS, self.pump, dora, self.nodes, self.pipes)
         assert isinstance(dialogue, MemberDialogue)
         self.dialogue, self.dora = dialogue, dora
