@@ -16,7 +16,7 @@ from dora_systemd.errors import REACHED_AS, DoraSystemdError
 from dora_systemd.terminal_text import escaped, one_line
 
 _STANDARD = ("stdin", "stdout", "stderr")
-"""By the number of their descriptors."""
+"""Streams by file descriptor."""
 VERBS = (
     *("deploy", "destroy", "disable", "doctor", "dora", "enable", "env", "export"),
     *("forget", "inhibit", "list", "logs", "machine", "member", "node", "releases", "reload"),

@@ -34,20 +34,15 @@ _MICROSECOND_NS = 1000
 
 @dataclass(frozen=True)
 class Foreground:
-    """What to print of a dataflow, and what stops it.
-
-    form: one of FORMATS. signals, stop_after: as for follow_unit(). notes: for people, printed once
-    the dataflow has been accepted. command: of doractl, for the journal. links: as for
-    start_unit().
-    """
+    """What to print of a dataflow, and what stops it."""
 
     shown: LogFilter = field(default_factory=LogFilter)
     form: str = FORMATS[0]
-    signals: Sequence[signal.Signals] = SIGNALS
-    stop_after: int = INFINITY
-    notes: Sequence[str] = ()
-    command: str = "doractl run"
-    links: Beside = ()
+    signals: Sequence[signal.Signals] = SIGNALS  # as for follow_unit()
+    stop_after: int = INFINITY  # as for follow_unit()
+    notes: Sequence[str] = ()  # human-readable, printed once the dataflow has been accepted
+    command: str = "doractl run"  # for the journal
+    links: Beside = ()  # as for start_unit()
 
 
 def print_until_end(

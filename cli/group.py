@@ -169,7 +169,6 @@ def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
 
 
 def _meant_verb(name: str) -> str:
-    """The hint for an unknown command."""
     from difflib import get_close_matches
 
     if name == "build":
@@ -188,7 +187,6 @@ def _near(error: click.NoSuchOption) -> list[str]:
 
 
 def _usage_error(error: click.ClickException) -> DoraSystemdError:
-    """An error of click in the form of all other errors."""
     text = error.format_message().rstrip(".")
     context: Any = getattr(error, "ctx", None)
     command = context.command_path if context else "doractl"

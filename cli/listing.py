@@ -199,7 +199,6 @@ def _print_nothing(request: ListRequest) -> None:
 
 
 def _print_json(found: DataflowRow | list[DataflowRow]) -> None:
-    """One object, or a list of them."""
     from dora_systemd.decisions.views.objects import dataflow_object, format_json
 
     if isinstance(found, DataflowRow):

@@ -103,11 +103,11 @@ def _remember_output(ctx: click.Context, param: click.Parameter, value: str) -> 
 
 
 output_option = _output_option(is_exposed=True)
-"""For a verb that has something to show."""
+"""Option for verbs that print facts."""
 
 
 def acting_options(command: C) -> C:
-    """For a verb that does something: scope_options, and `-o` for print_outcomes() and tell()."""
+    """Add scope_options, and `-o` for print_outcomes() and tell(), to a verb that acts."""
     return _output_option(is_exposed=False)(scope_options(command))
 
 
@@ -116,7 +116,7 @@ name_option = click.option(
     metavar="NAME",
     help="Name of the dataflow; default: that of its file, or of the directory of a dataflow.yml.",
 )
-"""For what starts a dataflow."""
+"""Option for verbs that start a dataflow."""
 
 
 def parsed_by(parse: Callable[[str], T]) -> Callable[[click.Context, click.Parameter, str], T]:
@@ -144,7 +144,7 @@ waiting_option = click.option(
     is_flag=True,
     help="Let nodes wait for what they need, such as a device that is not plugged in.",
 )
-"""For what has a trial."""
+"""Option for verbs with a trial of a release."""
 serial_option = click.option(
     "--serial",
     type=click.IntRange(min=1),
@@ -152,7 +152,7 @@ serial_option = click.option(
     default=1,
     help="With -H: N hosts at a time, and none after a failed trial; default: 1.",
 )
-"""For what brings a release to hosts."""
+"""Option for verbs that bring a release to hosts."""
 
 
 def current_scope(context: click.Context | None = None) -> Scope:

@@ -29,7 +29,7 @@ SIGN_SECONDS = 30.0
 quiet_option = click.option(
     "-q", "--quiet", "is_quiet", is_flag=True, help="Print nothing but errors."
 )
-"""For what has a Progress."""
+"""Option for verbs that show progress."""
 
 
 class Progress(AbstractContextManager["Progress"]):

@@ -38,7 +38,6 @@ def run_elsewhere(arguments: list[str]) -> int:
 
 
 def _like(group: click.Group, kind: type[click.Group]) -> click.Group:
-    """The same group as another kind."""
     return kind(
         group.name,
         params=group.params,

@@ -27,21 +27,16 @@ _FOLLOWING = ("is_follow", "until_end", "want_logs")
 
 
 class Plan(NamedTuple):
-    """A command for other hosts.
+    """A command for other hosts."""
 
-    verb: as typed, such as "node restart". acts: it prints an outcome in each line. is_endless:
-    somebody has to end it. options: by name, as click reads them. loud: the words without -q.
-    key: what JSON calls a host.
-    """
-
-    verb: str
+    verb: str  # as typed, such as "node restart"
     words: list[str]
-    loud: list[str]
-    options: dict[str, Any]
-    acts: bool
+    loud: list[str]  # the words without -q
+    options: dict[str, Any]  # by name, as click reads them
+    acts: bool  # it prints an outcome in each line
     wants_json: bool
-    is_endless: bool
-    key: str = "host"
+    is_endless: bool  # somebody has to end it
+    key: str = "host"  # what JSON calls a host
 
     @property
     def way(self) -> Way:

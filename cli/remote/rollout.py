@@ -168,7 +168,6 @@ class Rollout:
             self._send(said.host, answer, line)
 
     def _send(self, host: Host, answer: _Answer, line: str) -> None:
-        """Send what the host asks for in its first line."""
         assert self._package is not None
         answer.is_taking = True
         contents = parse_wants(read_json(line), self._package.parcel)

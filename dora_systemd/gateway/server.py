@@ -170,7 +170,6 @@ class Gateway:
             return await GET[path](Request(path, self._scope))
 
     async def _talk(self, socket: ServerSocket, raw: RawRequest) -> None:
-        """Serve one WebSocket connection."""
         path = _path(raw)
         try:
             await SOCKETS[path](socket, Request(path, self._scope))

@@ -64,7 +64,6 @@ def _stop_dataflows(bus: Bus, scope: Scope, force: bool) -> bool:
 
 
 def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
-    """Print what is left; whether nothing of ours is."""
     if others:
         tell(f"Not touched in dora.slice, not managed by doractl: {', '.join(others)}")
     names = enabled_names(bus, scope)

@@ -97,7 +97,7 @@ def _subscription(reply: Reply) -> str:
 
 
 async def unsubscribe_topics(talk: Talk, request: Request) -> Result:
-    """TopicUnsubscribe."""
+    """Answer TopicUnsubscribe."""
     ident = request.text("subscription_id")
     connection = talk.topics.pop(ident, None)
     if connection is None:

@@ -24,19 +24,17 @@ _MOST_TASKS = 16
 
 @dataclass
 class Talk:
-    """The state of one connection. No other connection shares it.
-
-    started: CLOCK_REALTIME µs by UUID, for dataflows that this connection has started. places: by
-    UUID and node, up to where the log has been sent. topics: by subscription id, the connection
-    that delivers it. is_over: the client has disconnected.
-    """
+    """The state of one connection. No other connection shares it."""
 
     socket: Socket
     scope: Scope
+    # When dataflows were started by this connection: CLOCK_REALTIME µs by UUID.
     started: dict[str, int] = field(default_factory=dict)
+    # Up to where the log has been sent, by UUID and node.
     places: dict[str, dict[str, Place]] = field(default_factory=dict)
+    # The connection that delivers a topic, by subscription id.
     topics: dict[str, Connection] = field(default_factory=dict)
-    is_over: bool = False
+    is_over: bool = False  # the client has disconnected
     _next: list[Task] = field(default_factory=list)
     _running: set["asyncio.Task[None]"] = field(default_factory=set)
 

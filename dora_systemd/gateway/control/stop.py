@@ -67,7 +67,6 @@ def _note_stop(scope: Scope, cell: Cell) -> None:
 
 
 def _restart(scope: Scope, cell: Cell) -> Outcome:
-    """Restart a dataflow that has been checked."""
     (outcome,) = restart_cells(Bus(scope), scope, [cell], "dora restart", is_forced=True)
     return outcome
 

@@ -61,7 +61,6 @@ def log_query(scope: Scope, message: PageMessage) -> tuple[LogQuery, Lines]:
 
 
 def _notes(cell: Cell, node: str) -> Lines:
-    """Where the lines of nodes on other machines are."""
     options = cell.options
     if options.machine or not options.placed:
         return []

@@ -39,7 +39,7 @@ INTERVAL_SECONDS = 2.0
 LONGEST_SECONDS = 10.0
 """Between snapshots, of any number of dataflows."""
 SHARE = 0.02
-"""Of a processor, for the snapshots of a page: many dataflows are looked at less often."""
+"""Maximum share of one CPU for the snapshots of a page; with many dataflows the interval grows."""
 MAX_TASKS = 8
 """Maximum parallel questions and actions of one page."""
 
@@ -54,14 +54,10 @@ _STREAMS = ("follow", "find", "unfollow")
 
 
 class Means(NamedTuple):
-    """How a page is served.
+    """How a page is served."""
 
-    interval: seconds between snapshots, at least. send_seconds: until a page that accepts no data
-    is given up; others would queue forever. follow, find: the lines of a dataflow.
-    """
-
-    interval: float = INTERVAL_SECONDS
-    send_seconds: float = 10.0
+    interval: float = INTERVAL_SECONDS  # seconds between snapshots, at least
+    send_seconds: float = 10.0  # until a page that accepts no data is given up, not queued for ever
     questions: Mapping[str, Callable[[Scope, str], dict[str, Any]]] = QUESTIONS
     follow: Callable[[Scope, PageMessage], AsyncGenerator[tuple[Lines, int], None]] = follow_lines
     find: Callable[[Scope, PageMessage, int], Awaitable[tuple[Lines, bool]]] = find_lines

@@ -124,10 +124,10 @@ def _rights(options: RunnerOptions, unit: Path) -> dict[str, str]:
 
 
 class Daemon(NamedTuple):
-    """A daemon. listen: its port for dynamic nodes."""
+    """A daemon of dora."""
 
     child: engine.Child
-    listen: int
+    listen: int  # its port for dynamic nodes
 
 
 def start_daemon(

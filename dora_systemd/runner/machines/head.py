@@ -270,7 +270,6 @@ class HeadDialogue(Dialogue):
         return False
 
     def _named(self) -> str:
-        """The members that are missing, and why."""
         missing = self._roster.missing() or self._unreached
         if not missing:
             return "the dora daemons of all machines"

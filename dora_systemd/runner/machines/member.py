@@ -232,7 +232,6 @@ class Member(Shared):
             self._end_by_head("the head has lost another machine")
 
     async def _answer_check(self, digest: str) -> None:
-        """Say whether this part could start again."""
         error = await asyncio.to_thread(self._find_refusal, digest)
         self.send(wire.Checked(error.message, error.hint) if error else wire.Checked())
 

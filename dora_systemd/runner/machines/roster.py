@@ -70,7 +70,6 @@ class Member:
 
 
 def _refusal(name: str, member: Member) -> DoraSystemdError | None:
-    """Why a member could not start its part again, or None."""
     if (told := member.checked) is not None:
         reason, hint = short_line(told.reason, _LONGEST), short_line(told.hint, _LONGEST)
         error = DoraSystemdError(f"machine {name}: {reason}", hint, ExitCode.BAD_INPUT)

@@ -26,16 +26,13 @@ _BACK = {How.ADD: How.REMOVE, How.REMOVE: How.ADD}
 
 @dataclass(frozen=True)
 class Run:
-    """The parts of one run of the dataflow that reloads use.
-
-    lock: held while nodes are replaced.
-    """
+    """The parts of one run of the dataflow that reloads use."""
 
     pump: Pump
     nodes: Nodes
     pipes: LogPipes
     swapper: Swapper
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)  # held while nodes are replaced
 
 
 async def tell_started(run: Run, tell: Callable[[], None]) -> None:

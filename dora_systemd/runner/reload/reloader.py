@@ -295,7 +295,6 @@ class Reloader:
         return DoraSystemdError(f"cannot use {self.options.dataflow}: {error}; {again}")
 
     async def _restart(self, run: Run, change: Change, reason: str) -> list[str]:
-        """End this run, and let the next one begin with the new version."""
         begun = time.monotonic()
         self.before = self.current if change.prepared is not self.current else None
         self.current, self.patience = change.prepared, patience(run.pump.cell)
@@ -374,7 +373,6 @@ def _place(options: RunnerOptions) -> tuple[str, str]:
 
 
 def _at(options: RunnerOptions, place: RunnerOptions) -> RunnerOptions:
-    """The options with the paths of `place`."""
     dataflow, directory = _place(place)
     return options._replace(dataflow=dataflow, working_directory=directory)
 

@@ -29,6 +29,9 @@ from dora_systemd.decisions.reload.watch_rules import WatchRules
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import let_openssl_in
 
+_LONGEST_SECONDS = 10.0
+"""For which a client that turns on hot reload waits for a large tree."""
+
 
 class Versions:
     """The identities of the files that each node runs.
@@ -82,16 +85,13 @@ def _identities(paths: Iterable[str]) -> dict[str, Identity | None]:
 
 @dataclass(frozen=True)
 class Change:
-    """What changed files mean. whole: why the whole dataflow has to start again, or "".
-
-    files: of the programs, by node.
-    """
+    """What changed files mean."""
 
     prepared: Prepared
     steps: tuple[Step, ...] = ()
-    whole: str = ""
+    whole: str = ""  # why the whole dataflow has to start again, or ""
     operators: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    files: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    files: Mapping[str, frozenset[str]] = field(default_factory=dict)  # of the programs, by node
 
     def with_node(self, node: str, dataflow: str) -> "Change":
         """The change, with a reload of `node` added if it is missing. Raises DoraSystemdError."""
@@ -233,10 +233,6 @@ def _read(path: str) -> str | None:
         return None
 
 
-_LONGEST = 10.0
-"""Seconds that whoever switches it on waits for a large tree."""
-
-
 class Watcher:
     """Reports changed files.
 
@@ -273,7 +269,7 @@ class Watcher:
             return
         seen = asyncio.create_task(self._has_seen.wait())
         first = asyncio.FIRST_COMPLETED
-        await asyncio.wait({self._task, seen}, timeout=_LONGEST, return_when=first)
+        await asyncio.wait({self._task, seen}, timeout=_LONGEST_SECONDS, return_when=first)
         seen.cancel()
 
     async def collect(self, options: RunnerOptions, since: Since | None = None) -> None:

@@ -59,17 +59,13 @@ def patience(cell: Cell) -> int:
 
 @dataclass(frozen=True)
 class Target:
-    """A node whose process has to end. status: before that. definition: as dora gets it.
-
-    has_readers: whether anything in the dataflow reads its outputs. grace: µs that the process has
-    to end.
-    """
+    """A node whose process has to end."""
 
     node: str
-    status: NodeStatus
-    definition: Mapping[str, Any]
-    has_readers: bool
-    grace: int
+    status: NodeStatus  # before that
+    definition: Mapping[str, Any]  # as dora gets it
+    has_readers: bool  # whether anything in the dataflow reads its outputs
+    grace: int  # µs that the process has to end
 
     @property
     def patience(self) -> int:
