@@ -1,12 +1,14 @@
 """`doractl why`: collects what systemd, the journal and the runner know about a dataflow."""
 
 from contextlib import suppress
+from time import monotonic, sleep
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus, is_stopped
 from dora_systemd.decisions.life import node_table
+from dora_systemd.decisions.life.causes import NO_END
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.past import FAILED as TRIAL_FAILED
 from dora_systemd.decisions.releases.past import Switch, completed, undone
@@ -32,6 +34,8 @@ from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.list import read_whole_rows
 
 _MOST_SHUTDOWNS = 20
+_MOST_BEHIND, _AGAIN = 2.0, 0.1
+"""Seconds that `why` waits for a record of the end, and between two reads."""
 WORDS_OF_START = 10
 """Maximum number of lines that a failed start prints."""
 
@@ -42,10 +46,8 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     Raises DoraSystemdError: NOT_FOUND, USAGE if several match.
     """
     cell, subject = _select(manager, scope, selector)
-    lives = read_lives(journal, scope, subject.name, subject.uuid, subject.is_loaded)
     facts = _facts(manager, scope, cell) if cell else Facts(now_boot=now_boot())
-    shutdowns = _shutdowns(journal)
-    verdict = examine(lives, facts, shutdowns)
+    verdict = _verdict(journal, scope, subject, facts)
     budget = None
     if cell and not verdict.is_given_up:
         budget = restart_budget(manager, scope, cell, read_status(scope, cell))
@@ -59,6 +61,22 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     machines = _machines(manager, cell) if cell and cell.options.placed else {}
     facts_of_trial = (last, is_of_trial)
     return Report(subject, verdict, words, budget, inhibitors, is_held, machines, *facts_of_trial)
+
+
+def _verdict(journal: JournalReader, scope: Scope, subject: Subject, facts: Facts) -> Verdict:
+    """The verdict of the journal.
+
+    systemd knows that a unit has ended before journald has written what systemd and the runner
+    report of that end, so an end without any record is read again.
+    """
+    shutdowns = _shutdowns(journal)
+    until = monotonic() + _MOST_BEHIND
+    while True:
+        lives = read_lives(journal, scope, subject.name, subject.uuid, subject.is_loaded)
+        verdict = examine(lives, facts, shutdowns)
+        if verdict.summary != NO_END or not subject.is_loaded or monotonic() > until:
+            return verdict
+        sleep(_AGAIN)
 
 
 def _trial_words(

@@ -1,13 +1,16 @@
 """The words with which a failed start ends, from a journal of our own."""
 
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.verbs.why import newest_failure, words_of_start
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.lives import now_boot
+from dora_systemd.verbs.why import explain, newest_failure, words_of_start
 from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_program
@@ -92,3 +95,29 @@ def test_the_newest_failure(
     other = UUID[:-1] + "7"
     journal.write(life_record("dataflow-failed", 9, "old", other, scope, DORA_REASON="it broke"))
     assert newest_failure(manager, scope) == other
+
+
+class SlowJournal:
+    """One whose journald has not written the end when it is read first."""
+
+    def __init__(self, boot: str) -> None:
+        self.reads = 0
+        self._boot = boot
+
+    def newest(
+        self, matches: Sequence[str], _limit: int | None, **more: object
+    ) -> Iterator[dict[str, Any]]:
+        if more != {"is_whole": True} or "DORA_NODE=camera" in matches:
+            return iter(())
+        self.reads += 1
+        written = EVENTS if self.reads > 2 else EVENTS[:1]
+        return iter([{**one, "_BOOT_ID": self._boot} for one in reversed(written)])
+
+
+def test_an_end_that_journald_has_not_written_yet_is_read_again(scope: Scope) -> None:
+    manager = FakeManager()
+    manager.add(options(), ActiveState="failed", Result="exit-code")
+    journal = SlowJournal(now_boot())
+    verdict = explain(manager, scope, "robot", journal).verdict  # type: ignore[arg-type]
+    assert verdict.summary.startswith("node camera: exit code 3")
+    assert journal.reads == 3
