@@ -22,7 +22,7 @@ FORMS = ["container", "vm"]
 def images(request: pytest.FixtureRequest) -> None:
     """Build what is missing, in sight of who waits: what the lab says then is no test's output."""
     with request.config.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled():
-        for form in FORMS:
+        for form in (*FORMS, "emulator"):
             subprocess.run([LAB, "build"], env={**os.environ, "LAB": form}, check=True)
 
 
