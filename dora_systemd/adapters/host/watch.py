@@ -102,7 +102,7 @@ async def changed_files(
     while True:
         await _wait_root(rules.root)
         is_unsure = True
-        async for paths, is_new in _with_start(_bursts(rules, idle_ms)):
+        async for paths, is_new in _with_start(rules, idle_ms):
             files = seen.take(path for path in paths if rules.has(path))
             # Found by their identity: changes before the new watches, and those that watchfiles
             # drops because they arrive between its copy of others and the clearing of its list.
@@ -209,31 +209,42 @@ def read_gitignores(root: str) -> dict[str, tuple[str, ...]]:
 
 
 async def _with_start(
-    bursts: AsyncGenerator[frozenset[str]],
+    rules: WatchRules, idle_ms: int
 ) -> AsyncIterator[tuple[frozenset[str], bool]]:
-    """The same bursts. True stands beside the first one, and beside an early one without paths.
+    """Yield the bursts. True stands beside the first one, and beside an early one without paths.
 
-    The early one comes when the watches should exist, the first one when they certainly do.
+    The early one comes when the watches should exist, the first one when they certainly do. The
+    bursts end where a directory has no watch, because it was created after the list was made.
     """
+    directories = await asyncio.to_thread(watched_directories, rules)
+
+    async def are_all() -> bool:
+        return directories == await asyncio.to_thread(watched_directories, rules)
+
+    bursts = _bursts(rules, directories, idle_ms)
     first = asyncio.ensure_future(anext(bursts))
     try:
         done, _ = await asyncio.wait({first}, timeout=_NEW_SECONDS)
         if not done:
             yield frozenset(), True
+            if not await are_all():
+                return
         with contextlib.suppress(StopAsyncIteration):
             yield await first, True
-            async for paths in bursts:
-                yield paths, False
+            if await are_all():
+                async for paths in bursts:
+                    yield paths, False
     finally:
         first.cancel()
 
 
-async def _bursts(rules: WatchRules, idle_ms: int) -> AsyncGenerator[frozenset[str]]:
+async def _bursts(
+    rules: WatchRules, directories: list[str], idle_ms: int
+) -> AsyncGenerator[frozenset[str]]:
     """Paths of changed files, until a directory is created or deleted; none each `idle_ms`."""
     # Imported late: only hot reload needs it.
     from watchfiles import Change, awatch
 
-    directories = await asyncio.to_thread(watched_directories, rules)
     before = await asyncio.to_thread(_inodes, directories)
     try:
         async for changes in awatch(

@@ -1,8 +1,9 @@
 """Watched files, with the real inotify."""
 
 import asyncio
+import shutil
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import watchfiles
 from dora_systemd.adapters.host import watch
 from dora_systemd.decisions.reload.watch_rules import WatchRules
 from dora_systemd.errors import DoraSystemdError
+from tests.lab.pace import bound
 
 SECONDS = 20.0
 
@@ -186,6 +188,100 @@ def test_a_project_that_is_replaced(tmp_path: Path, name: str, is_back: bool, co
         task.cancel()
 
     asyncio.run(work())
+
+
+def move_away(place: Path, other: Path) -> None:
+    place.rename(other.with_name("before"))
+
+
+def move_in(place: Path, other: Path) -> None:
+    other.rename(place)
+
+
+def remove(place: Path, _: Path) -> None:
+    shutil.rmtree(place)
+
+
+def copy_in(place: Path, other: Path) -> None:
+    shutil.copytree(other, place)
+
+
+Step = Callable[[Path, Path], None]
+AWAY: dict[str, tuple[Step, float, Step]] = {
+    "moved away, and another one there later": (move_away, 1.2, move_in),
+    "removed, and copied there later": (remove, 1.2, copy_in),
+    "removed, and copied there soon": (remove, 0.3, copy_in),
+}
+
+
+@pytest.mark.parametrize(("leave", "seconds", "come"), AWAY.values(), ids=AWAY)
+def test_a_project_that_was_away_is_seen_at_once(
+    tmp_path: Path, leave: Step, seconds: float, come: Step
+) -> None:
+    """Not only when watchfiles has waited in vain for a change, which never happens here."""
+    place, other = tmp_path / "project", tmp_path / "other"
+    for one in (place, other):
+        (one / "lib").mkdir(parents=True)
+        (one / "node.py").write_text(one.name)
+        (one / "lib/part.py").write_text(one.name)
+    node, part = str(place / "node.py"), str(place / "lib/part.py")
+    rules, looks = WatchRules(str(place), ("*.py",)), asyncio.Event()
+    found: list[str] = []
+
+    async def collect() -> None:
+        async for files in watch.changed_files(rules, looks.set, idle_ms=600_000):
+            found.extend(path for path in files if Path(path).exists())
+
+    async def until_found(*paths: str) -> None:
+        async with asyncio.timeout(bound(3)):
+            while not set(paths) <= set(found):
+                await asyncio.sleep(0.01)
+        assert set(found) <= {node, part}
+        found.clear()
+
+    async def work() -> None:
+        task = asyncio.create_task(collect())
+        await looks.wait()
+        Path(node).write_text("first")
+        await until_found(node)
+        leave(place, other)
+        await asyncio.sleep(seconds)
+        come(place, other)
+        await until_found(node, part)
+        Path(part).write_text("new")
+        await until_found(part)
+        task.cancel()
+
+    asyncio.run(work())
+
+
+def test_a_directory_that_comes_before_the_watches_exist_is_watched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when a project is copied to its place, one directory after the other."""
+    real = watchfiles.awatch
+    saved = tmp_path / "lib/part.py"
+
+    async def late(*directories: str, **options: Any) -> AsyncIterator[Any]:
+        if not saved.exists():
+            saved.parent.mkdir()
+            saved.write_text("")
+        async for changes in real(*directories, **options):
+            yield changes
+
+    async def save_twice() -> list[frozenset[str]]:
+        found = []
+        rules = WatchRules(str(tmp_path), ("*.py",))
+        async with asyncio.timeout(bound(5)):
+            async for files in watch.changed_files(rules, idle_ms=600_000):
+                found.append(files)
+                if len(found) == 2:
+                    break
+                asyncio.get_running_loop().call_later(1, saved.write_text, "changed")
+        return found
+
+    monkeypatch.setattr(watchfiles, "awatch", late)
+    assert asyncio.run(save_twice()) == [{str(saved)}] * 2
 
 
 def test_hot_reload_where_nothing_can_watch_files() -> None:
