@@ -160,9 +160,9 @@ def _check_trust(read: SettingsFile) -> None:
 
 
 def _untrusted(read: SettingsFile, key: str, flag: str) -> DoraSystemdError:
-    reason = read.place.changeable
-    return DoraSystemdError(
-        f"cannot use {shown(str(read.path))}: {key} is set there, and {reason}",
-        f"give {flag} on the command line, or set it in {SYSTEM_FILE}",
-        ExitCode.NO_PERMISSION,
-    )
+    hint = f"give {flag} on the command line, or set it in {SYSTEM_FILE}"
+    if read.path == SYSTEM_FILE:
+        hint = f"chown root: {SYSTEM_FILE}; chmod go-w {SYSTEM_FILE}"
+    message = f"{key} is set there, and {read.place.changeable}"
+    message = f"cannot use {shown(str(read.path))}: {message}"
+    return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)

@@ -24,7 +24,14 @@ from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
-from dora_systemd.verbs.start.settings import check_config, read_settings, settings_files
+from dora_systemd.verbs.start.settings import (
+    SYSTEM_FILE,
+    check_config,
+    read_settings,
+    read_settings_file,
+    require_modest,
+    settings_files,
+)
 from tests.unit.fakes.programs import make_dora, make_program
 
 USER = Scope(is_user=True, uid=os.getuid())
@@ -242,6 +249,44 @@ def test_whom_to_believe(project: Path, key: str) -> None:
     os.chown(project, 65534, 65534)
     with pytest.raises(DoraSystemdError, match="nobody owns a directory above it"):
         read_settings(SYSTEM, project / "robot.yml", {}, {})
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="its files are root's")
+@pytest.mark.parametrize("key", ROOT_ONLY)
+@pytest.mark.parametrize(("mode", "is_refused"), [(0o666, True), (0o664, True), (0o644, False)])
+def test_a_settings_file_that_others_can_write(
+    project: Path, key: str, mode: int, is_refused: bool
+) -> None:
+    """A group counts as others, as for a hosts file."""
+    beside = project / "robot.systemd.yml"
+    beside.write_text(f"{key}: {ROOT_ONLY[key]}\n")
+    beside.chmod(mode)
+    if not is_refused:
+        check_config(SYSTEM, beside)
+        return
+    for read in (lambda: read_settings(SYSTEM, project / "robot.yml", {}, {}),
+                 lambda: check_config(SYSTEM, beside)):  # fmt: skip
+        with pytest.raises(DoraSystemdError) as caught:
+            read()
+        assert caught.value.message == (
+            f"cannot use {beside}: {key} is set there, and others than root can write to the file"
+        )
+        assert caught.value.code is ExitCode.NO_PERMISSION
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="its files are root's")
+def test_the_settings_file_of_all_dataflows_that_others_can_write(project: Path) -> None:
+    """The hint does not send its reader to the file that is refused."""
+    config = project / "config.yml"
+    config.write_text("nice: -5\n")
+    config.chmod(0o666)
+    read = read_settings_file(config)
+    with pytest.raises(DoraSystemdError) as caught:
+        require_modest(read)
+    assert caught.value.hint.startswith("give --nice on the command line, or set it in /etc/")
+    with pytest.raises(DoraSystemdError) as caught:
+        require_modest(replace(read, path=SYSTEM_FILE))
+    assert caught.value.hint == f"chown root: {SYSTEM_FILE}; chmod go-w {SYSTEM_FILE}"
 
 
 RAISING = {
