@@ -2,6 +2,7 @@
 
 import json
 import re
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -81,6 +82,39 @@ def test_each_step_of_a_progress_bar_is_seen_when_the_next_one_begins() -> None:
     shown = [splitter.feed(b"\r%d%%" % step) for step in range(4)]
     assert shown == [[], [b"0%"], [b"1%"], [b"2%"]]
     assert splitter.rest == b"3%"
+
+
+class Counted(bytes):
+    """Bytes that count how many of them are looked through for the end of a line."""
+
+    searched = 0
+
+    def __add__(self, other: Any) -> "Counted":
+        return Counted(bytes(self) + other)
+
+    def __radd__(self, other: bytes) -> "Counted":
+        return Counted(other + bytes(self))
+
+    def __contains__(self, wanted: object) -> bool:
+        Counted.searched += len(self)
+        return super().__contains__(wanted)  # type: ignore[operator]
+
+    def removesuffix(self, suffix: Any) -> "Counted":
+        return Counted(super().removesuffix(suffix))
+
+    def split(self, *sep: Any) -> list[bytes]:
+        Counted.searched += len(self)
+        return super().split(*sep)
+
+
+def test_a_long_line_is_not_looked_through_again_for_each_of_its_chunks() -> None:
+    chunk, number = b"x" * 8192, 1024
+    Counted.searched = 0
+    splitter = LineSplitter()
+    pieces = [line for _ in range(number) for line in splitter.feed(Counted(chunk))]
+    assert {type(piece) for piece in pieces} == {Piece}
+    assert b"".join([*pieces, splitter.rest]) == chunk * number
+    assert 0 < Counted.searched <= 3 * len(chunk) * number
 
 
 def test_plain_line() -> None:
