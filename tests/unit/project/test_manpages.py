@@ -9,6 +9,7 @@ import click
 import pytest
 
 from dora_systemd.adapters.host import files
+from dora_systemd.adapters.host.watch import IDLE_MS
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.decisions.gateway.place import ADDRESS_VARIABLE, PORT_VARIABLE
 from dora_systemd.decisions.life.states import RunnerExit
@@ -16,6 +17,7 @@ from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.schema import validate_settings
 from dora_systemd.decisions.settings.table import SETTINGS
+from dora_systemd.decisions.why.remedies import known_remedy
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.start.settings import SYSTEM_FILE
 from tests.unit.checkout import CHECKOUT
@@ -189,6 +191,25 @@ def test_events() -> None:
 
 def events_text() -> str:
     return sections("dora-systemd-logs.7")["LIFE EVENTS"]
+
+
+def test_options_that_other_pages_name() -> None:
+    foreign = {"-hub-override", "-locked", "-no-block"}  # dora's and systemctl's
+    declared = COMMON.union(*map(declared_options, all_verbs().values()))
+    text = "".join(page.read_text() for page in PAGES if page.name != "doractl.1")
+    named = set(re.findall(r"\bFl (-[a-z][a-z-]*)", text))
+    assert named - {flag[1:] for flag in declared} == foreign
+
+
+def test_the_cache_of_uv_is_that_of_the_hint() -> None:
+    hint = known_remedy(["error: Failed to initialize cache at `/.cache/uv`"])
+    (options,) = re.findall(r"--property CacheDirectory=NAME --env \S+", hint)
+    text = sections("dora-systemd-security.7")["SANDBOX"]
+    assert options.replace("NAME", "robot") in text
+
+
+def test_when_a_replaced_directory_is_noticed() -> None:
+    assert f"within {IDLE_MS // 1000} seconds" in sections("dora-systemd-nodes.7")["HOT RELOAD"]
 
 
 def test_files() -> None:
