@@ -250,7 +250,7 @@ class Roster:
             self._give_up(name, message, Cause.MACHINE_REFUSES)
         elif isinstance(message, wire.Ended):
             self._ended(name, message)
-        elif isinstance(message, wire.Lost):
+        elif isinstance(message, wire.Lost) and not self._members[name].has_left:
             has_failed = message.words == wire.RUNNER_ENDED
             self._ended(name, wire.Ended(message.words, failed=int(has_failed)))
         elif isinstance(message, wire.Unreached):

@@ -153,7 +153,8 @@ def test_a_member_that_ends_without_a_word() -> None:
 def test_a_member_that_has_ended_in_peace_is_not_lost() -> None:
     async def work(bench: Bench) -> None:
         other = await bench.link()
-        other.say(READY, wire.Ended())
+        # What its link says after that is the end of what has left.
+        other.say(READY, wire.Ended(), wire.Lost(wire.RUNNER_ENDED))
         other.reader.feed_eof()
         await settle()
         assert bench.heard() == [life.MachineJoined(0, "gpu")]
