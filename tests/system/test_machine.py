@@ -308,7 +308,8 @@ def test_a_busy_node_has_its_share(cell: Cell, project: Project) -> None:
     wait_for("it has its share", is_held, 60)
     (row,) = [one for one in listed(cell)["nodes"] if one["node"] == "sink"]
     assert row["cpu_limit_percent"] == 40
-    assert row["throttled_percent"] > 80
+    # Each period, where nothing else keeps the machine from running.
+    assert row["throttled_percent"] > 50
     (event,) = wait_for("it is told", lambda: cell.journal("DORA_EVENT=cpu-throttled"), 60)
     assert event["DORA_NODE"] == "sink"
     assert abs(row["cpu_percent"] - 40) < 5
