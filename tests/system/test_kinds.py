@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
 
+from dora_systemd.verbs.start.account import DEFAULT_USER
 from tests.system.cells import Cell, Project, command_line, run, wait_for
 
 TICK = "inputs: {tick: dora/timer/millis/50}"
@@ -77,6 +79,19 @@ def test_uv(cell: Cell, project: Project) -> None:
     cell.start(flow_of(project, "path: speaker.py"), "--uv", "--env", "UV_OFFLINE=1",
                "--env", "UV_CACHE_DIR=/tmp/uv")  # fmt: skip
     assert cell.status.nodes["one"].kind == "uv"
+    check(cell, "one", project.root)
+
+
+@pytest.mark.warns("crashed", "exit code 2", "ExitCode(2)", "Failed to start", "Failed with")
+def test_a_node_that_is_uv_itself(cell: Cell, project: Project) -> None:
+    """It cannot write the cache of uv; what the hint says gives it one."""
+    project.write("speaker.py", SPEAKER)
+    words = "run --offline --no-project python3 speaker.py"
+    flow = flow_of(project, f"path: uv, args: {words}")
+    failed = cell.start(flow, "--uid", DEFAULT_USER, check=False)
+    assert failed.returncode != 0
+    (hint,) = re.findall(r"--property CacheDirectory=NAME --env \S+", failed.stderr)
+    cell.start(flow, "--uid", DEFAULT_USER, *hint.replace("NAME", cell.name).split())
     check(cell, "one", project.root)
 
 
