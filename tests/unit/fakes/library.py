@@ -97,7 +97,7 @@ class FakeSystemd:
         return self.manager.read(unit, [name])[name]
 
     def _job(self, method: str, unit: str) -> str:
-        job = f"/job/{method}"
+        job = f"/job/{method}/{unit}"
         result = self.manager.run_jobs(method, [unit])[unit]
         self._waiting.append((job, result))
         if not self.is_slow:

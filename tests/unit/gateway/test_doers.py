@@ -80,6 +80,28 @@ def test_the_page_stops_a_dataflow_and_says_who_asked(bench: Bench) -> None:
     assert b"(status page)" in note
 
 
+@pytest.mark.parametrize(
+    ("door", "notes"),
+    [("page", ("(status page)", "(status page)")), ("dora", ("(dora stop)", "(dora stop robot)"))],
+)
+def test_who_has_stopped_what_ends_with_another_one(
+    bench: Bench, door: str, notes: tuple[str, str]
+) -> None:
+    """The page and the dora command name who has asked for the end of those that need it, too."""
+    for uuid, name in ((NOBODY, "arm"), (NOBODY.replace("1", "6"), "old")):
+        bench.manager.add(options(name, uuid), active="active" if name == "arm" else "failed")
+    bench.manager.units[UNIT]["RequiredBy"] = ["dora-arm.service", "dora-old.service"]
+    if door == "page":
+        ends = [one.partition(":")[0] for one in bench.act("stop").split("; ")]
+        assert ends == ["Dataflow stopped"] * 2
+        assert [call[1] for call in bench.manager.calls] == [UNIT, "dora-arm.service"]
+    else:
+        bench.ask("StopByName", name="robot", force=True)
+    for name, by, note in zip(("robot", "arm"), notes, bench.notes, strict=True):
+        assert f"DORA_DATAFLOW_NAME={name}\n".encode() in note
+        assert by.encode() in note
+
+
 def test_the_page_restarts_a_dataflow(bench: Bench) -> None:
     assert bench.act("restart") == f"Dataflow restarted: {UUID} (robot)"
     assert bench.jobs == ["RestartUnit"]
@@ -306,6 +328,27 @@ def test_a_dora_restart_asks_for_locks(bench: Bench) -> None:
     assert not bench.notes
     bench.ask("Restart", dataflow_uuid=UUID)
     assert bench.jobs == ["RestartUnit"]
+
+
+@pytest.mark.parametrize("door", ["Restart", "RestartByName", "page"])
+def test_what_could_not_start_again_keeps_running(bench: Bench, door: str) -> None:
+    """Also for the dora command and the page, which have no --force."""
+    refused = {"error": "node a has no path", "hint": "did you mean 'path'?", "code": 6}
+    with (
+        fake_runner(bench.scope.cell_directory("robot"), refused=refused) as asked,
+        pytest.raises(DoraSystemdError, match=r"^node a has no path$") as caught,
+    ):
+        if door == "page":
+            bench.act("restart")
+        else:
+            bench.ask(door, dataflow_uuid=UUID, name="robot", force=True)
+    assert {"verb": "check"} in asked
+    assert caught.value.code == refused["code"]
+    assert caught.value.hint == (
+        "did you mean 'path'? robot keeps running; doractl restart --force robot restarts it anyway"
+    )
+    assert not bench.jobs
+    assert not bench.notes, "nobody has asked for an end that has not come"
 
 
 def test_a_dora_restart_that_fails(bench: Bench) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
-from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
+from dora_systemd.decisions.cell.status import HELD, LATCHED, RESTART, STOP, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.table import step
@@ -78,6 +78,33 @@ def test_the_others_are_stopped_and_the_dataflow_has_failed(
 def test_what_ends_nothing(of_a: dict[str, Any], event: life.NodeExited) -> None:
     cell, _ = live(running(**of_a), event)
     assert (cell.state, cell.failure) == (State.RUNNING, "")
+
+
+def asked(what: str) -> life.NodeAsked:
+    return life.NodeAsked(0, "a", what, "root (doractl node)")
+
+
+@pytest.mark.parametrize("what", [STOP, RESTART])
+@pytest.mark.parametrize("number", [0, 1, 143, -9, -15])
+@pytest.mark.parametrize("state", ["running", "waiting"])
+def test_an_end_that_somebody_asks_for_ends_nothing(what: str, number: int, state: str) -> None:
+    """Whether it runs or waits for a device, in any exit status; a stopped one stays stopped."""
+    nodes = {**running().nodes, "a": NodeStatus(state, 7)}
+    cell, actions = live(replace(running(), nodes=nodes), asked(what), exited("a", number=number))
+    assert (cell.state, cell.failure) == (State.RUNNING, "")
+    assert "node-crashed a" not in records(actions)
+    assert (cell.nodes["a"].state == "stopped") is (what == STOP)
+
+
+@pytest.mark.parametrize("is_stopped_before", [False, True])
+def test_a_process_after_an_asked_restart_is_not_taken_back(is_stopped_before: bool) -> None:
+    """Nothing goes back to another version: the dataflow is without a node that it needs."""
+    before = [asked(STOP), exited("a")] if is_stopped_before else []
+    after = [asked(RESTART)] if is_stopped_before else [asked(RESTART), exited("a")]
+    cell, _ = live(running(), *before, *after, life.NodeSpawned(1, "a", 9))
+    assert (cell.state, cell.failure) == (State.RUNNING, "")
+    cell, _ = live(cell, exited("a"))
+    assert (cell.state, cell.failure) == (State.STOPPING, "essential node a: exit code 1")
 
 
 @pytest.mark.parametrize(("restarts", "is_ended"), [(0, False), (1, True)])
