@@ -48,7 +48,7 @@ def command(selector: str | None, arguments: tuple[str, ...], why: str | None) -
         hint = f"doractl inhibit {selector} --why TEXT; doractl inhibit lists all locks"
         raise DoraSystemdError("cannot inhibit without a reason", hint, ExitCode.USAGE)
     reason, scope = parse_reason(why), current_scope()
-    cell = Selector(selector).find(Bus(scope))
+    cell = Selector(selector).find_present(Bus(scope), scope)
     lock = take_inhibiting(scope, cell, reason)
     if not arguments:
         print_outcomes([Outcome(cell, f"Dataflow inhibited: {cell.uuid} ({cell.name})")])

@@ -53,7 +53,7 @@ def stop(selector: str, node: str, force: bool, wait: bool) -> int:
 
 def _order(selector: str, what: str, node: str, how: IfInhibited) -> int:
     scope = current_scope()
-    cell = Selector(selector).find(Bus(scope))
+    cell = Selector(selector).find_present(Bus(scope), scope)
     given = NodeOrder(what, node, _DOORS[what])
     done = order_node(scope, cell, given, how=how, tell=TellWaiting())
     return print_outcomes([Outcome(cell, done, node=node)])

@@ -29,7 +29,7 @@ def command(selector: str, node: str | None, force: bool, wait: bool) -> int:
     """
     how = if_inhibited(force, wait)
     scope = current_scope()
-    cell = Selector(selector).find(Bus(scope))
+    cell = Selector(selector).find_present(Bus(scope), scope)
     require_uninhibited(scope, [cell], "reload", how, TellWaiting())
     done = [f"{line[:1].upper()}{line[1:]}" for line in reload_cell(scope, cell, node)]
     text = "\n".join(done) or "Nothing has changed"

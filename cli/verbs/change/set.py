@@ -46,7 +46,7 @@ def command(selector: str, hot_reload: str | None, force: bool, **flags: Any) ->
     """
     scope = current_scope()
     bus = Bus(scope)
-    cell = Selector(selector).find(bus)
+    cell = Selector(selector).find_present(bus, scope)
     refuse_on_trial(scope, cell, "set")
     if hot_reload is not None:
         require_running(cell)

@@ -24,7 +24,7 @@ def command(selector: str, arguments: tuple[str, ...]) -> int:
     """
     scope = current_scope()
     bus = Bus(scope)
-    cell = Selector(selector).find(bus)
+    cell = Selector(selector).find_present(bus, scope)
     if told := order_like_dora(scope, cell, arguments):
         click.echo(told)
         return 0

@@ -24,4 +24,4 @@ def command(selector: str) -> None:
     """
     scope = current_scope()
     bus = Bus(scope, for_reading=True)
-    write_exactly(export_cell(bus, scope, Selector(selector).find(bus)))
+    write_exactly(export_cell(bus, scope, Selector(selector).find_present(bus, scope)))

@@ -22,8 +22,9 @@ def command(selector: str, output: str) -> None:
       doractl show robot
       doractl show robot -o json
     """
-    bus = Bus(current_scope(), for_reading=True)
-    cell = Selector(selector).find(bus)
+    scope = current_scope()
+    bus = Bus(scope, for_reading=True)
+    cell = Selector(selector).find_present(bus, scope)
     files = unit_files(bus, cell)
     if output == "json":
         print_json({"name": cell.name, "uuid": cell.uuid, "unit": cell.unit, "files": files})

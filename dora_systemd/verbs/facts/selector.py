@@ -6,6 +6,7 @@ the same words and give the same errors. `list` without a name does not load thi
 
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, TypeVar
@@ -42,9 +43,9 @@ N = TypeVar("N", bound=Named)
 class Selector:
     """The text that a user has typed: a name, a unit, a UUID, or the beginning of a UUID.
 
-    Only meant() decides what a text means. only(), proven(), loaded(), find(), find_enabled() and
-    ended() differ in where they look. They raise DoraSystemdError: USAGE if several dataflows
-    match, and those that return no None, NOT_FOUND if none does.
+    Only meant() decides what a text means. only(), proven(), loaded(), find(), find_present(),
+    find_enabled() and ended() differ in where they look. They raise DoraSystemdError: USAGE if
+    several dataflows match, and those that return no None, NOT_FOUND if none does.
     """
 
     text: str
@@ -114,6 +115,17 @@ class Selector:
         files = filter(None, (read_cell(manager, unit_name(one)) for one in names))
         return next(files, None) or self.loaded(cells)
 
+    def find_present(self, manager: Manager, scope: Scope) -> Cell:
+        """As find(); NOT_RUNNING for one that has ended, which only the journal knows."""
+        try:
+            return self.find(manager)
+        except DoraSystemdError as error:
+            row = self._recorded(scope) if error.code is ExitCode.NOT_FOUND else None
+            if row is None:
+                raise
+        message = f"cannot use the dataflow {row.name}: it has ended"
+        raise DoraSystemdError(message, f"doractl start {row.name}", ExitCode.NOT_RUNNING)
+
     def find_enabled(self, manager: Manager, scope: Scope) -> Cell:
         """As find(), also an enabled one that systemd has lost, see lost_units()."""
         try:
@@ -130,6 +142,12 @@ class Selector:
         from dora_systemd.verbs.facts.ended import ended_rows
 
         return next(iter(self.meant(ended_rows(scope))), None)
+
+    def _recorded(self, scope: Scope) -> "DataflowRow | None":
+        """As ended(), also None for a user who may not read the journal."""
+        with suppress(DoraSystemdError):
+            return self.ended(scope)
+        return None
 
 
 def selectors_of(texts: Sequence[str], known: Iterable[Named]) -> list[Selector]:

@@ -136,6 +136,29 @@ def test_the_newest_one_that_has_ended(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert Selector("nobody").ended(scope) is None
 
 
+def test_what_has_ended_is_known_and_not_there(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """`set` and `inhibit` have nothing to change; "no dataflow named" is for what nobody knows."""
+    scope, manager = ScopeIn(is_user=True, uid=1000, root=tmp_path), FakeManager()
+    manager.add(options("other", THIRD))
+    journal = FakeJournal(monkeypatch, tmp_path)
+    journal.write(life_record("dataflow-stopped", 1, "robot", UUID, scope=scope))
+    for text in ("robot", UUID[:8]):
+        with pytest.raises(DoraSystemdError, match="use the dataflow robot: it has end") as caught:
+            Selector(text).find_present(manager, scope)
+        assert (caught.value.code, caught.value.hint) == (
+            ExitCode.NOT_RUNNING,
+            "doractl start robot",
+        )
+    assert Selector("other").find_present(manager, scope).name == "other"
+    with pytest.raises(DoraSystemdError, match="no dataflow named 'nobody'"):
+        Selector("nobody").find_present(manager, scope)
+    journal.complain("no permission")
+    with pytest.raises(DoraSystemdError, match="no dataflow named 'robot'"):
+        Selector("robot").find_present(manager, scope)
+
+
 class Unloaded(FakeManager):
     """Units that are found by name only."""
 
