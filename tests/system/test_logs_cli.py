@@ -140,7 +140,7 @@ def test_repetitions_on_a_terminal(talking: Cell) -> None:
     text = re.sub(r"\x1b\[[0-9;:]*m", "", shown("doractl", talking.scope.flag, *words))
     said = [line.partition(" cam-left ")[2].strip() for line in text.splitlines()]
     assert said.count("tick") == 1
-    assert f"... {ticks} times" in said
+    assert f"... the same line, {ticks} times in all" in said
 
 
 def test_journalctl_shows_the_same(talking: Cell) -> None:

@@ -22,7 +22,7 @@ def repeated(text: str, times: int) -> str:
     """What stands below a line that came so often in all: "" for a single one."""
     if times < 3:
         return text * (times - 1)
-    return f"... {times} times"
+    return f"... the same line, {times} times in all"
 
 
 def is_end_of(text: str, nodes: Collection[str]) -> bool:

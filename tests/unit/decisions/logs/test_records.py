@@ -100,7 +100,13 @@ def test_which_lines_are_the_same(one: bytes, other: bytes, are_same: bool) -> N
 
 
 @pytest.mark.parametrize(
-    ("times", "shown"), [(1, ""), (2, "a"), (3, "... 3 times"), (99, "... 99 times")]
+    ("times", "shown"),
+    [
+        (1, ""),
+        (2, "a"),
+        (3, "... the same line, 3 times in all"),
+        (99, "... the same line, 99 times in all"),
+    ],
 )
 def test_how_often_a_line_came(times: int, shown: str) -> None:
     assert repeated("a", times) == shown

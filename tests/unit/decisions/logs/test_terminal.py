@@ -85,7 +85,9 @@ def test_long_names_and_texts_are_not_kept() -> None:
 def test_repetitions_are_told_before_they_are_forgotten() -> None:
     lines = TerminalLines()
     others = b"".join(SHORT.replace(b"camera", b"n%d" % n) + b"hi\n" for n in range(MOST_NAMES))
-    assert b"camera ... 4 times\n" in plain(fed(lines, (SHORT + b"one\n") * 4 + others))
+    assert b"camera ... the same line, 4 times in all\n" in plain(
+        fed(lines, (SHORT + b"one\n") * 4 + others)
+    )
 
 
 def test_color_of_a_node_is_always_the_same() -> None:
@@ -128,7 +130,11 @@ def test_repetitions_are_counted_by_node() -> None:
     data = b"".join(line("camera", "slow", i) + line("sink", "idle", i) for i in range(5))
     assert texts(data + line("camera", "fast", 7)) == [
         *("00 camera slow", "00 sink   idle"),
-        *("04 camera ... 5 times", "07 camera fast", "04 sink   ... 5 times"),
+        *(
+            "04 camera ... the same line, 5 times in all",
+            "07 camera fast",
+            "04 sink   ... the same line, 5 times in all",
+        ),
     ]
 
 
@@ -138,8 +144,14 @@ def test_repetitions_are_counted_by_node() -> None:
         (["a", "a"], ["a", "a"]),
         (["a", "b", "a"], ["a", "b", "a"]),
         (["line 1", "line 2", "line 3"], ["line 1", "line 2", "line 3"]),
-        (["07:50:52,123 x", "07:50:53,004 x", "07:51:00,999 x"], ["07:50:52,123 x", "... 3 times"]),
-        (["2026-11-21T07:50:52.1Z x"] * 3, ["2026-11-21T07:50:52.1Z x", "... 3 times"]),
+        (
+            ["07:50:52,123 x", "07:50:53,004 x", "07:51:00,999 x"],
+            ["07:50:52,123 x", "... the same line, 3 times in all"],
+        ),
+        (
+            ["2026-11-21T07:50:52.1Z x"] * 3,
+            ["2026-11-21T07:50:52.1Z x", "... the same line, 3 times in all"],
+        ),
         (["at 07:50:52 1", "at 07:50:53 2"], ["at 07:50:52 1", "at 07:50:53 2"]),
     ],
 )
@@ -161,4 +173,4 @@ def test_a_line_of_other_bytes_that_comes_again() -> None:
     again = SHORT.replace(b"camera", b"k\xfcche") + b"gr\xfc\xdf\n"
     found = plain(fed(TerminalLines(), again * 3)).splitlines()
     assert len(found) == 2
-    assert found[1] == rb"Nov 21 01:02:59 k\xfcche ... 3 times"
+    assert found[1] == rb"Nov 21 01:02:59 k\xfcche ... the same line, 3 times in all"

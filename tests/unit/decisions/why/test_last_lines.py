@@ -79,15 +79,21 @@ def test_not_all_of_a_flood_is_read() -> None:
 
 def test_shown() -> None:
     words = [Word(1, "a", "x"), Word(2, "a", "y", 2), Word(3, "a", "z", 19)]
-    assert [one.text for one in shown_last(words, 9)] == ["x", "y", "y", "z", "... 19 times"]
-    assert [one.text for one in shown_last(words, 2)] == ["z", "... 19 times"]
+    assert [one.text for one in shown_last(words, 9)] == [
+        "x",
+        "y",
+        "y",
+        "z",
+        "... the same line, 19 times in all",
+    ]
+    assert [one.text for one in shown_last(words, 2)] == ["z", "... the same line, 19 times in all"]
     assert shown_last([], 2) == []
 
 
 def test_report() -> None:
     subject = Subject("u", "robot", "dora-robot.service", "--system")
     report = Report(subject, Verdict("Failed", node="camera"), (Word(1, "camera", SLOW, 19),))
-    assert "  ... 19 times" in format_report(report, width=80)
+    assert "  ... the same line, 19 times in all" in format_report(report, width=80)
 
 
 FULL = "OSError: [Errno 28] No space left on device"

@@ -97,7 +97,7 @@ What happened:
 The last 2 lines of camera (all: doractl logs robot --node camera):
   13:00:04  loading
   13:00:05  slow
-  13:00:05  ... 3 times
+  13:00:05  ... the same line, 3 times in all
 
 What to do:
   look for a leak in camera, or run: doractl set robot --node-limit camera:memory=SIZE"""
