@@ -53,11 +53,14 @@ class DoraCheck:
         """Call `call`, which reads the dataflow, while the checks run; its result.
 
         Its error takes precedence over that of dora about the same file: doractl reports it before
-        a start, too. Without access to the file, or without dora, that is the error.
+        a start, too. Without access to the file, or without dora, that is the error; but not if the
+        file is missing, for dora may be missing with the whole project.
         """
         try:
             found = call()
         except DoraSystemdError:
+            if _is_missing(self._options.dataflow):
+                raise
             check_access(self._options)
             self.version()
             raise

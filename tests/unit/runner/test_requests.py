@@ -356,3 +356,20 @@ def test_what_could_not(options: RunnerOptions, name: str, text: str, words: str
     refused = ask(options, verb="check")["refused"]
     assert words in refused["error"]
     assert name in refused["error"]
+
+
+@pytest.mark.parametrize("place", ["project/.venv/dora", "dora"])
+def test_a_project_that_is_gone(options: RunnerOptions, tmp_path: Path, place: str) -> None:
+    """Its file is named, and neither the dora command nor the directory of a process."""
+    project = tmp_path / "project"
+    flow = project / "robot.yml"
+    dora = make_dora(tmp_path / place, "1.1.0")
+    project.mkdir(exist_ok=True)
+    flow.write_text(FLOW)
+    (project / "a.py").touch()
+    placed = options._replace(dataflow=str(flow), working_directory=str(project), dora=dora)
+    assert ask(placed, verb="check")["refused"] is None
+    project.rename(tmp_path / "elsewhere")
+    refused = ask(placed, verb="check")["refused"]
+    assert refused["error"] == f"cannot read {flow}: there is no such file"
+    assert refused["code"] == ExitCode.BAD_INPUT
