@@ -28,6 +28,23 @@ for event in Node():
         print("line", count)
         count += 1
 """
+STRUCK = """
+[...document.querySelectorAll('#detail .charts .chart')].map((chart) => {
+  const place = (name) => chart.querySelector(name).getBoundingClientRect();
+  return [place('.top').bottom, place('.line').top];
+}).filter(([label, line]) => label > line)
+"""
+LAST = """
+import('/page/why.js').then(({ Why }) => {
+  const why = new Why(() => 0);
+  const lines = LINES.map((text) => ({ at_us: 1, node: 'cam', text }));
+  why.show({ why: {
+    status: 'Failed', summary: 'x', node: 'cam', last_lines: lines, timeline: [], remedies: [],
+    starved: [], restart_history: [], details: {}, at_us: 1,
+  } });
+  return why.node.querySelector('.words h3').textContent;
+})
+"""
 
 
 def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
@@ -42,7 +59,9 @@ def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
     # From the second snapshot on there is a line to draw.
     browser.wait_js("document.querySelector('#detail .charts .line').getAttribute('d') !== ''")
     browser.wait_text("#detail .charts .memory .value", "MiB")
-    browser.wait_text("#detail .charts .axis", "now")
+    for words in ("now", " ago"):
+        browser.wait_text("#detail .charts .axis", words)
+    assert browser.js(STRUCK) == [], "no line goes through the label of a chart"
     browser.point("#detail .charts svg", 0.98)
     browser.wait_text("#detail .charts .of", "at ")
     drawn = "[...document.querySelectorAll('.graph {}')].map((e) => e.textContent)"
@@ -53,6 +72,13 @@ def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
         "doubler → sink: double",
     }
     browser.wait_text(".lines", "got [")
+    shown = browser.js(
+        "[...document.querySelectorAll('#detail .nodes li')].map((e) => e.dataset.node)"
+    )
+    listed = json.loads(cell.doractl("list", cell.name, "-o", "json").stdout)["nodes"]
+    assert shown == [one["node"] for one in listed] == ["source", "doubler", "sink"]
+    assert browser.js(LAST.replace("LINES", json.dumps(["a"]))) == "The last line of cam"
+    assert browser.js(LAST.replace("LINES", json.dumps(["a", "b"]))) == "The last 2 lines of cam"
     assert browser.failures() == []
 
 

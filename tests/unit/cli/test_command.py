@@ -155,6 +155,23 @@ def test_wrong_command_lines(
 
 
 @pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        *(("inspect", "show"), ("stat", "status"), ("monit", "top"), ("htop", "top")),
+        *(("rm", "stop"), ("kill", "stop"), ("delete", "stop"), ("remove", "stop")),
+        *(("down", "destroy"), ("log", "logs"), ("journal", "logs"), ("create", "start")),
+        *(("check", "start --dry-run"), ("validate", "start --dry-run")),
+    ],
+)
+def test_commands_of_others(word: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """What docker, pm2, systemctl and dora call it; a similar word would lead elsewhere."""
+    assert main.run([word, "robot"]) == ExitCode.USAGE
+    first, hint = capsys.readouterr().err.splitlines()
+    assert first == f"doractl: unknown command '{word}'"
+    assert hint == f"hint: did you mean doractl {meant}?"
+
+
+@pytest.mark.parametrize(
     "arguments", [["--user", "x"], ["x", "--user"], ["--system", "x", "--user"]]
 )
 def test_scope_before_and_after_the_verb(arguments: list[str]) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from dora_systemd.cli.remote import machines
 from dora_systemd.cli.remote.plan import Plan
+from dora_systemd.cli.remote.run import run_on_all
 from dora_systemd.cli.verbs.look.logs import command
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.remote.hosts import Host
@@ -14,8 +15,10 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import LINK_PREFIX
 from dora_systemd.scope import scope_of
 from dora_systemd.verbs.logs import has_unit, unit_places
+from dora_systemd.verbs.remote.talk import ANSWER_SECONDS
 from tests.unit.fakes.library import fake_systemd
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.fakes.programs import make_program
 from tests.unit.verbs.facts.test_machines import WORDS
 
 PLACED = (Placed("yolo", "gpu"),)
@@ -91,6 +94,35 @@ def test_wrong_machines(words: tuple[str, ...], code: ExitCode) -> None:
     with pytest.raises(DoraSystemdError) as caught:
         found(*words)
     assert caught.value.code is code
+
+
+HERE = """printf '__REALTIME_TIMESTAMP=1\\nSYSLOG_IDENTIFIER=robot/cam\\nMESSAGE=here\\n\\n'"""
+LOGIN = 'for command; do :; done\nHOST=gpu; export HOST; exec sh -c "$command"'
+
+
+class Hasty(Plan):
+    """A plan whose bound is shorter."""
+
+    @property
+    def silence(self) -> float | None:
+        return super().silence and 0.5
+
+
+def test_a_member_that_says_nothing_holds_up_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has logged in: the lines of the head are printed, and the member is named."""
+    make_program(tmp_path / "ssh", LOGIN)
+    make_program(tmp_path / "doractl", f'[ "$HOST" = gpu ] && exec sleep 1000\n{HERE}')
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    asked = found("robot")
+    assert asked
+    hosts, plan = asked
+    assert plan.silence == ANSWER_SECONDS
+    assert run_on_all(hosts, Hasty(*plan)) == ExitCode.NO_HOST
+    out, err = capsys.readouterr()
+    assert "here" in out
+    assert err.startswith("doractl: cannot reach gpu: no answer within 0.5s\n")
 
 
 def test_another_scope_is_not_merged(capsys: pytest.CaptureFixture[str]) -> None:
