@@ -217,4 +217,4 @@ def test_verbs_that_need_a_running_dataflow(cell: Cell, project: Project) -> Non
     cell.start(flow, "--no-wait")
     cell.doractl("stop", cell.name)
     for words in (["show", cell.name], ["dora", cell.name, "--", "list"]):
-        assert cell.doractl(*words, check=False).returncode == ExitCode.NOT_FOUND
+        assert cell.doractl(*words, check=False).returncode == ExitCode.NOT_RUNNING

@@ -1,7 +1,7 @@
 """The cgroups of nodes: counters of memory and CPU, and freezing while the journal is behind."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +15,17 @@ from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_own
 from dora_systemd.decisions.resources.pressure import Alarms, Load, look
 from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, throttled_percent
 
+_ONE_SHORTAGE = 5.0
+"""Seconds in which what the kernel kills after the first process has the same reason."""
+
 
 class Resources:
     """Counters of the unit's cgroups, kept from one sample to the next."""
 
-    def __init__(self, unit: Path) -> None:
+    def __init__(self, unit: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._unit = unit
+        self._clock = clock
+        self._short_until = 0.0
         self._seen: dict[Path, OomCounts] = {unit: read_oom(unit)}
         self._alarms: Alarms = {}
 
@@ -31,8 +36,15 @@ class Resources:
             return None
         unit = self._seen[self._unit], read_oom(self._unit)
         self._seen |= {group: node[1], self._unit: unit[1]}
-        owner = find_owner(node, unit)
+        owner = self._same(find_owner(node, unit))
         return None if owner is None else self._oom(owner, group)
+
+    def _same(self, owner: Owner | None) -> Owner | None:
+        """The owner; all that one full dataflow has killed is read with its first process."""
+        if owner is Owner.DATAFLOW:
+            self._short_until = self._clock() + _ONE_SHORTAGE
+        is_same = owner is Owner.MACHINE and self._clock() < self._short_until
+        return Owner.DATAFLOW if is_same else owner
 
     def _oom(self, owner: Owner, group: Path) -> Oom:
         peak = cgroup.read_usage(group).memory_peak or 0
