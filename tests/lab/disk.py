@@ -7,7 +7,7 @@ from pathlib import Path
 from lab import definition
 from lab.cache import Layer, ensure_locked
 from lab.errors import Stage
-from lab.image import base_layer, debian_command
+from lab.image import base_layer, unpacked_layer
 from lab.process import run_logged
 
 SIZE = "6G"
@@ -41,22 +41,13 @@ Options=ro,hostfs=/usr/lib/uml/modules
 
 def disk_layer(cache: Path) -> Layer:
     sources = [definition.read_part(definition.HERE / name) for name in SOURCES]
-    key = definition.digest(definition.base_key(), kernel_key(), sources)
+    key = definition.digest(definition.base_key(), kernel_layer(cache).key, sources)
     return Layer("disk", key, lambda path: build_disk(path, cache))
 
 
 def kernel_layer(cache: Path) -> Layer:
-    return Layer("kernel", kernel_key(), lambda path: build_kernel(path, cache / "build.log"))
-
-
-def kernel_key() -> str:
-    return definition.digest(definition.SUITE, definition.KERNEL)
-
-
-def build_kernel(path: Path, log: Path) -> None:
-    with Stage(definition.KERNEL):
-        command = debian_command(path, "extract", [definition.KERNEL, "busybox-static"])
-        run_logged(command, log, "download the kernel")
+    """Debian's own kernel, for an emulator."""
+    return unpacked_layer(cache, "kernel", [definition.KERNEL, "busybox-static"])
 
 
 def build_disk(path: Path, cache: Path) -> None:

@@ -6,27 +6,15 @@ the machine takes it four times longer. It is unpacked, not installed: its own l
 
 from pathlib import Path
 
-from lab import definition
 from lab.cache import Layer
-from lab.errors import Stage
-from lab.image import debian_command
-from lab.process import run_logged
+from lab.image import unpacked_layer
 
 PACKAGES = ["qemu-system-x86", "qemu-utils"]
 LIBRARIES = "usr/lib/x86_64-linux-gnu"
 
 
 def emulator_layer(cache: Path) -> Layer:
-    return Layer("emulator", key(), lambda path: build_emulator(path, cache / "build.log"))
-
-
-def key() -> str:
-    return definition.digest(definition.SUITE, PACKAGES)
-
-
-def build_emulator(path: Path, log: Path) -> None:
-    with Stage(f"emulator of Debian {definition.SUITE}"):
-        run_logged(debian_command(path, "extract", PACKAGES), log, "download the emulator")
+    return unpacked_layer(cache, "emulator", PACKAGES)
 
 
 def program(layer: Path, name: str) -> list[str]:

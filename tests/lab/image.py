@@ -68,6 +68,19 @@ def debian_command(
     ]  # fmt: skip
 
 
+def unpacked_layer(
+    cache: Path, kind: str, packages: list[str], suite: str = definition.SUITE
+) -> Layer:
+    """The files of Debian packages, which are not installed."""
+
+    def build(path: Path) -> None:
+        with Stage(f"{kind}: {', '.join(packages)} of Debian {suite}"):
+            command = debian_command(path, "extract", packages, suite)
+            run_logged(command, cache / "build.log", f"download {packages[0]}")
+
+    return Layer(kind, definition.digest(suite, packages), build)
+
+
 def build_tree(path: Path, cache: Path) -> None:
     """A copy of the base by hard links: pip and useradd replace files, they do not rewrite them."""
     base = ensure_locked(cache, base_layer(cache))

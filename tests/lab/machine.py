@@ -21,6 +21,11 @@ from lab.terminal import is_terminal, kept_terminal
 from lab.user_kernel import booted_user_kernel
 
 COPY = "copy the checkout into"
+UNPACK = """\
+mount -t hostfs -o hostfs=/share share /mnt
+for one in /mnt/*.tar; do tar --extract --file="$one" --directory=/; done
+umount /mnt
+"""
 
 
 def run_in_vm(run: Run, disk: Path, options: Options) -> int:
@@ -41,10 +46,7 @@ def share_checkout(guest: Guest, share: Path) -> None:
     check_packed(pack.returncode)
     for number, archive in enumerate(added_archives()):
         shutil.copy(archive, share / f"added-{number}.tar")
-    command = ["mount", "-t", "hostfs", "-o", "hostfs=/share", "share", "/mnt"]
-    check_guest(guest.run_quietly(command), "read the checkout in")
-    script = 'for one in /mnt/*.tar; do tar --extract --file="$one" --directory=/ || exit; done'
-    check_guest(guest.run_quietly(["sh", "-c", f"{script}; umount /mnt"]), COPY)
+    check_guest(guest.run_quietly(["sh", "-ec", UNPACK]), COPY)
 
 
 def push_checkout(guest: Guest) -> None:

@@ -58,8 +58,8 @@ def plan_test(form: str) -> list[Step]:
     inside, several = (replace(one, after=(unit.name,)) for one in (inside, several))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
     oldest = plan_bookworm(form)[1:]
-    lane = [build, packages_step(), *oldest, *plan_lab(form), *plan_other_python(form)]
-    lane += plan_emulator(form)
+    others = [*plan_lab(form), *plan_other_python(form), *plan_emulator(form)]
+    lane = [build, packages_step(), *oldest, *others]
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
     return [unit, several, *in_a_row(lane, unit), inside, restarted, *queue]
 
@@ -191,7 +191,7 @@ def machines_step() -> Step:
 def plan_faults(form: str) -> list[Step]:
     """Every fault as often as ROUNDS says; a machine of its own, and nothing beside it."""
     rounds = os.environ.get("ROUNDS") or "1"
-    marks = form if form in MACHINES else NO_KERNEL
+    marks = "vm" if form in MACHINES else NO_KERNEL
     command = ["tests/lab/lab", "run", "--env", f"FAULT_ROUNDS={rounds}", "--", "pytest"]
     command += [FAULTS, "-m", marks]
     return [Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))]

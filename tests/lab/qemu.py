@@ -12,6 +12,7 @@ from typing import Any
 from lab.emulator import firmware, program
 from lab.errors import LabError
 from lab.process import die_with_parent, read_last_line
+from lab.runs import CONSOLE
 from lab.slow import slowed
 
 KERNEL_OPTIONS = (
@@ -36,7 +37,7 @@ def machine_command(
         "-device", "virtio-serial-pci",
         "-chardev", f"socket,id=agent,path={place / 'agent'},server=on,wait=on",
         "-device", "virtserialport,chardev=agent,name=lab",
-        "-chardev", f"file,id=console,path={place / 'console'}",
+        "-chardev", f"file,id=console,path={place / CONSOLE}",
         "-serial", "chardev:console",
         "-qmp", f"unix:{place / 'qmp'},server=on,wait=off",
         *load,

@@ -12,11 +12,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from lab.cache import take_lock, try_lock
+from lab.cache import find_cache, take_lock, try_lock
 from lab.errors import LabError
 from lab.pace import bound
 
 RUNS = Path("/run/dora-systemd-lab")
+CONSOLE = "console"
+"""The file of a run with what a machine prints on its console."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,14 @@ def open_run() -> Run:
         directory = RUNS / f"lab-{secrets.token_hex(4)}"
         directory.mkdir(mode=0o700)
         return Run(directory, take_lock(directory / "lock", fcntl.LOCK_EX))
+
+
+def with_console(error: LabError, run: Run) -> LabError:
+    """The error of a machine, with what its console has said kept beside the images."""
+    kept = find_cache() / "console.log"
+    with suppress(FileNotFoundError):
+        shutil.copy(run.directory / CONSOLE, kept)
+    return LabError(error.message, error.hint or f"see {kept}")
 
 
 class Guard:

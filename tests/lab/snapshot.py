@@ -4,10 +4,10 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
-from lab import definition, emulator, qemu
+from lab import definition, qemu
 from lab.cache import Layer, ensure, ensure_locked, find_cache
 from lab.disk import NAME, disk_layer, kernel_layer
 from lab.emulator import emulator_layer, program
@@ -16,7 +16,7 @@ from lab.guest import Guest
 from lab.initrd import write_initrd
 from lab.pace import bound
 from lab.process import need_tools, run_logged
-from lab.runs import Run, close_run, note, open_run
+from lab.runs import Run, close_run, note, open_run, with_console
 from lab.slow import FULL_SPEED, read_speed
 
 SNAPSHOT = "booted"
@@ -38,7 +38,7 @@ def ensure_snapshot(cache: Path) -> Path:
     disk = disk_layer(cache)
     ensure(cache, disk)
     sources = [definition.read_part(definition.HERE / name) for name in SOURCES]
-    key = definition.digest(disk.key, emulator.key(), sources)
+    key = definition.digest(disk.key, emulator_layer(cache).key, sources)
     return ensure(cache, Layer("snapshot", key, lambda path: build_snapshot(path, cache)))
 
 
@@ -82,10 +82,7 @@ def started_emulator(run: Run, layer: Path, disk: Path, snapshot: str = "") -> I
         with qemu.started(command, run.directory, speed) as port:
             yield Guest(port)
     except LabError as error:
-        kept = find_cache() / "console.log"
-        with suppress(FileNotFoundError):
-            shutil.copy(run.directory / "console", kept)
-        raise LabError(error.message, error.hint or f"see {kept}") from None
+        raise with_console(error, run) from None
 
 
 def warm_up(guest: Guest) -> None:

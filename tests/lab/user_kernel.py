@@ -6,23 +6,22 @@ Debian 13 does not start on processors with AMX.
 """
 
 import os
-import shutil
 import socket
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from lab import cgroup, definition
 from lab.cache import Layer, ensure, find_cache
 from lab.disk import NAME, disk_layer
-from lab.errors import LabError, Stage
+from lab.errors import LabError
 from lab.guest import Guest
-from lab.image import debian_command
+from lab.image import unpacked_layer
 from lab.line import steady_line
 from lab.pace import bound
-from lab.process import die_with_parent, need_tools, read_last_line, run_logged
-from lab.runs import Run, note, remove_cgroup
+from lab.process import die_with_parent, need_tools, read_last_line
+from lab.runs import CONSOLE, Run, note, remove_cgroup, with_console
 from lab.slow import read_speed, slowed
 
 PACKAGES = ["user-mode-linux", "libc6"]
@@ -51,25 +50,18 @@ exec env -i HOME=/tmp TMPDIR=/tmp "$(command -v chroot)" "$root" "$@"
 def ensure_user_kernel(cache: Path) -> Path:
     """The directory of its disk."""
     need_tools("mmdebstrap", "mke2fs")
-    ensure(cache, kernel_layer(cache))
+    ensure(cache, user_kernel_layer(cache))
     return ensure(cache, disk_layer(cache))
 
 
-def kernel_layer(cache: Path) -> Layer:
-    key = definition.digest(definition.NEW_SUITE, PACKAGES)
-    return Layer("user-kernel", key, lambda path: build_kernel(path, cache / "build.log"))
-
-
-def build_kernel(path: Path, log: Path) -> None:
-    with Stage(f"user-mode-linux of Debian {definition.NEW_SUITE}"):
-        command = debian_command(path, "extract", PACKAGES, definition.NEW_SUITE)
-        run_logged(command, log, "download the kernel")
+def user_kernel_layer(cache: Path) -> Layer:
+    return unpacked_layer(cache, "user-kernel", PACKAGES, definition.NEW_SUITE)
 
 
 @contextmanager
 def booted_user_kernel(run: Run, disk: Path) -> Iterator[Guest]:
     cache = find_cache()
-    kernel = cache / kernel_layer(cache).name
+    kernel = cache / user_kernel_layer(cache).name
     speed = read_speed(os.environ.get("LAB_SPEED"))
     changes = disk / f"{run.name}.cow"
     note(run, "disk", changes)
@@ -79,7 +71,7 @@ def booted_user_kernel(run: Run, disk: Path) -> Iterator[Guest]:
     enter, group = cgroup.enter_command(run.name)
     note(run, "cgroup", group)
     script = ["unshare", "--mount", "--propagation", "private", "sh", "-c", SCRIPT, "sh", *place]
-    with ours, (run.directory / "log").open("wb") as log:
+    with ours, (run.directory / CONSOLE).open("wb") as log:
         process = subprocess.Popen(
             [*enter, *die_with_parent([*script, *words])],
             stdin=subprocess.DEVNULL,
@@ -95,7 +87,8 @@ def booted_user_kernel(run: Run, disk: Path) -> Iterator[Guest]:
                 guest.wait_boot(bound(BOOT_SECONDS))
                 yield guest
         except LabError as error:
-            raise with_log(error, run) from None
+            last = read_last_line(run.directory / CONSOLE)
+            raise with_console(LabError(f"{error.message}: {last}", error.hint), run) from None
         finally:
             remove_cgroup(group)
             process.kill()
@@ -108,11 +101,3 @@ def kernel_command(port: int, changes: str) -> list[str]:
         f"ubd0=/disk/{changes},/disk/{NAME}", "root=/dev/ubda", "rw",
         "con=null", "con0=null,fd:1", f"ssl0=fd:{port},fd:{port}", "quiet", "loglevel=3", "panic=1",
     ]  # fmt: skip
-
-
-def with_log(error: LabError, run: Run) -> LabError:
-    kept = find_cache() / "console.log"
-    with suppress(FileNotFoundError):
-        shutil.copy(run.directory / "log", kept)
-    said = f"{error.message}: {read_last_line(kept)}" if kept.exists() else error.message
-    return LabError(said, error.hint or f"see {kept}")
