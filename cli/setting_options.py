@@ -40,9 +40,8 @@ class SettingsCommand(click.Command):
 
     def format_help(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write all of it, or of text and examples the beginning."""
-        super(SettingsCommand, self._shortened() if self._is_short(ctx) else self).format_help(
-            ctx, formatter
-        )
+        shown = self._shortened() if self._is_short(ctx) else self
+        super(SettingsCommand, shown).format_help(ctx, formatter)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the usual options, or all by concern."""
@@ -61,27 +60,27 @@ class SettingsCommand(click.Command):
         short.epilog = "\n".join((self.epilog or "").splitlines()[: 2 + _EXAMPLES])
         return short
 
-    def _format_usual(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        records = [
-            (parameter.opts[0], record)
+    def _records(self, ctx: click.Context) -> list[tuple[click.Option, tuple[str, str]]]:
+        return [
+            (parameter, record)
             for parameter in self.get_params(ctx)
             if isinstance(parameter, click.Option) and (record := parameter.get_help_record(ctx))
         ]
-        of = dict(records)
+
+    def _format_usual(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        of = {option.opts[0]: record for option, record in self._records(ctx)}
         # Of a help text what stands before the first semicolon; --help=all has the rest.
         rows = [
             (of[flag][0].split(" / ")[0], f"{of[flag][1].split('; ')[0].rstrip('.')}.")
             for flag in self._usual
         ]
         with formatter.section("Usual options"):
-            formatter.write_dl([*rows, (HELP_ALL, f"Show all {len(records)} options.")])
+            formatter.write_dl([*rows, (HELP_ALL, f"Show all {len(of)} options.")])
 
     def _format_all(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         sections: dict[str, list[tuple[str, str]]] = {title: [] for title in ("Options", *SECTIONS)}
-        for parameter in self.get_params(ctx):
-            if isinstance(parameter, click.Option) and (record := parameter.get_help_record(ctx)):
-                title = _SECTION_OF.get(parameter.name or "", "Options")
-                sections[title].append(record)
+        for option, record in self._records(ctx):
+            sections[_SECTION_OF.get(option.name or "", "Options")].append(record)
         for title, records in sections.items():
             if records:
                 with formatter.section(title):

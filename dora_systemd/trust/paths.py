@@ -78,6 +78,14 @@ class Place(NamedTuple):
         return ""
 
 
+def hint_of_changeable(path: Path, roots: Path, otherwise: str) -> str:
+    """What root does about a file that others can change.
+
+    roots: the file that root is meant to write. otherwise: what to do instead of using another one.
+    """
+    return f"chown root: {roots}; chmod go-w {roots}" if path == roots else otherwise
+
+
 @contextlib.contextmanager
 def reached(path: str | Path) -> Iterator[tuple[int, Place]]:
     """Walk to the absolute `path`; a descriptor (O_PATH) and its place.

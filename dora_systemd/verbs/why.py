@@ -1,11 +1,10 @@
 """`doractl why`: collects what systemd, the journal and the runner know about a dataflow."""
 
 from contextlib import suppress
-from time import monotonic, sleep
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.adapters.journal.reader import JournalReader, read_when_written
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus, is_stopped
 from dora_systemd.decisions.life import node_table
 from dora_systemd.decisions.life.causes import NO_END
@@ -34,8 +33,6 @@ from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.list import read_whole_rows
 
 _MOST_SHUTDOWNS = 20
-_MOST_BEHIND, _AGAIN = 2.0, 0.1
-"""Seconds that `why` waits for a record of the end, and between two reads."""
 WORDS_OF_START = 10
 """Maximum number of lines that a failed start prints."""
 
@@ -70,13 +67,12 @@ def _verdict(journal: JournalReader, scope: Scope, subject: Subject, facts: Fact
     report of that end, so an end without any record is read again.
     """
     shutdowns = _shutdowns(journal)
-    until = monotonic() + _MOST_BEHIND
-    while True:
+
+    def read() -> Verdict:
         lives = read_lives(journal, scope, subject.name, subject.uuid, subject.is_loaded)
-        verdict = examine(lives, facts, shutdowns)
-        if verdict.summary != NO_END or not subject.is_loaded or monotonic() > until:
-            return verdict
-        sleep(_AGAIN)
+        return examine(lives, facts, shutdowns)
+
+    return read_when_written(read, lambda one: subject.is_loaded and one.summary == NO_END)
 
 
 def _trial_words(

@@ -83,7 +83,7 @@ def command(
       doractl start dataflow.yml --name robot
       doractl start dataflow.yml --enable     now and at every boot
       doractl start dataflow.yml --memory-limit 4G --restart-policy on-failure
-      doractl start robot                     what list --all shows, once more
+      doractl start robot                     a dataflow that has ended, again
       doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
       doractl start dataflow.yml --node-limit camera:cpu=1.5 --max-restarts 3
       doractl start dataflow.yml --credential token=/etc/robot/token

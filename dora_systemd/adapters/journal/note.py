@@ -38,7 +38,7 @@ def note_request(event: str, name: str, uuid: str, command: str, **details: str)
 
 
 def requester(command: str) -> str:
-    """Who asks in this process, and by which command, as in "root (doractl stop)"."""
+    """Format the user of this process and the command: "root (doractl stop)"."""
     return f"{caller(os.getuid(), os.environ)} ({command})"
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import groupby, islice, takewhile
 from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from dora_systemd.adapters.journal.journalctl import (
     CHUNK,
@@ -29,6 +29,11 @@ from dora_systemd.decisions.views.findings import Place
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
 from dora_systemd.scope import Scope
+
+_MOST_BEHIND, _AGAIN = 2.0, 0.1
+"""Seconds that journald may take on a busy machine to write a record, and between two reads."""
+
+T = TypeVar("T")
 
 ROOT = Path("/")
 """The directory with all files of the machine."""
@@ -195,6 +200,16 @@ class JournalReader:
         records = self.newest(matches, None)
         ids = (str(record.get("_SYSTEMD_INVOCATION_ID", "")) for record in records)
         yield from (invocation for invocation, _ in groupby(ids) if invocation)
+
+
+def read_when_written(read: Callable[[], T], is_behind: Callable[[T], bool]) -> T:
+    """What `read` gives. It is read again for a moment while journald is behind with it."""
+    deadline = time.monotonic() + _MOST_BEHIND
+    found = read()
+    while time.monotonic() <= deadline and is_behind(found):
+        time.sleep(_AGAIN)
+        found = read()
+    return found
 
 
 def _lines(arguments: Sequence[str], bounds: Bounds) -> Iterator[bytes]:

@@ -297,7 +297,7 @@ def is_stopping(node: NodeStatus) -> bool:
 def format_stopped(stopped: Mapping[str, str]) -> str:
     """As "plot, requested by root (doractl node stop)"; "" if nobody has stopped a node.
 
-    stopped: by node, who has asked for its stop, or "".
+    stopped: for each node the user and command that requested its stop, or "".
     """
     by = dict.fromkeys(filter(None, stopped.values()))
     parts = (
@@ -308,5 +308,5 @@ def format_stopped(stopped: Mapping[str, str]) -> str:
 
 
 def format_asked(by: str) -> str:
-    """Who has asked, as in "requested by root (doractl node stop)"."""
+    """Format the user and command of a request: "requested by root (doractl node stop)"."""
     return f"requested by {by}"

@@ -261,7 +261,7 @@ class MachineLost(Event):
 
     machine: str
     reason: str
-    by: str = ""  # who has stopped its part there, or ""
+    by: str = ""  # the user who stopped its part on that machine, or ""
     # whether its part has failed, while the machine and the way to it are well
     is_failure: bool = False
 

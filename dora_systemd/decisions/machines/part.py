@@ -130,7 +130,7 @@ def differing(here: Digests, there: Digests) -> list[str]:
 
 
 def format_differing(found: Mapping[str, Sequence[str]]) -> str:
-    """One line for people; "" if nothing differs. found: by machine."""
+    """Format the files that differ as one line, "" if none does. found: by machine."""
     parts = (
         f"machine {machine} runs another {_names(files)} than the one here"
         for machine, files in found.items()

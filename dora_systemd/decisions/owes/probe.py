@@ -113,8 +113,8 @@ class Flow:
 def find_feeds(owes: Sequence[Owed], dataflow: Dataflow, is_here: Callable[[str], bool]) -> Feeds:
     """The feeds of the nodes in `owes`. is_here: whether this machine runs that node.
 
-    A message from another machine would take the network once more. In a circle the input of a node
-    ends because its output does, so it proves nothing.
+    The probe receives no messages of other machines: each would cross the network a second time. In
+    a circle the input of a node ends because its output does, so it proves nothing.
     """
     slots = {one.place: at for at, one in enumerate(owes)}
     owing, downstream = {one.node for one in owes}, downstream_of(dataflow)

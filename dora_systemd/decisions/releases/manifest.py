@@ -1,4 +1,4 @@
-"""release.json: what a release is, for people, for a rollback, and to check its files. Pure.
+"""release.json: describes a release for people and for a rollback, and its files. Pure.
 
 Also makes the id of a release, which names.py reads.
 """

@@ -16,7 +16,7 @@ from dora_systemd.decisions.resources.pressure import Alarms, Load, look
 from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, throttled_percent
 
 _ONE_SHORTAGE = 5.0
-"""Seconds in which what the kernel kills after the first process has the same reason."""
+"""Seconds in which the kernel kills further processes for the same reason."""
 
 
 class Resources:
@@ -40,7 +40,7 @@ class Resources:
         return None if owner is None else self._oom(owner, group)
 
     def _same(self, owner: Owner | None) -> Owner | None:
-        """The owner; all that one full dataflow has killed is read with its first process."""
+        """The owner. The first process takes the counter of the unit, also for further ones."""
         if owner is Owner.DATAFLOW:
             self._short_until = self._clock() + _ONE_SHORTAGE
         is_same = owner is Owner.MACHINE and self._clock() < self._short_until

@@ -1,7 +1,6 @@
 """Which records of the journal a user means: of which dataflows, nodes and runs."""
 
 import re
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -9,7 +8,7 @@ from fnmatch import fnmatchcase
 from itertools import islice
 from typing import NamedTuple
 
-from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.adapters.journal.reader import JournalReader, read_when_written
 from dora_systemd.decisions.logs.query import LogQuery
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -21,22 +20,25 @@ _MOST_FITTING = 100
 """Maximum UUIDs with the same beginning: anybody can write records with more."""
 
 
-_BEHIND_SECONDS = 2.0
-"""How long journald may take on a busy machine for what a dataflow has said at its start."""
-_LOOK_SECONDS = 0.1
-
-
 def find_soon(find: Callable[[], LogQuery], scope: Scope, selectors: Sequence[str]) -> LogQuery:
     """What `find` gives, as find_query(). A dataflow that runs may just not be recorded yet."""
-    deadline = time.monotonic() + _BEHIND_SECONDS
-    while True:
+
+    def read() -> LogQuery | DoraSystemdError:
         try:
             return find()
         except DoraSystemdError as error:
-            is_over = time.monotonic() > deadline or not selectors
-            if error.code is not ExitCode.NOT_FOUND or is_over or not _is_loaded(scope, selectors):
+            if error.code is not ExitCode.NOT_FOUND:
                 raise
-        time.sleep(_LOOK_SECONDS)
+            return error
+
+    def is_behind(found: LogQuery | DoraSystemdError) -> bool:
+        is_error = isinstance(found, DoraSystemdError)
+        return is_error and bool(selectors) and _is_loaded(scope, selectors)
+
+    found = read_when_written(read, is_behind)
+    if isinstance(found, DoraSystemdError):
+        raise found
+    return found
 
 
 def _is_loaded(scope: Scope, selectors: Sequence[str]) -> bool:

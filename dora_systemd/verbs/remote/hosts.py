@@ -9,7 +9,7 @@ from dora_systemd.decisions.remote.hosts import ALL, Host, parse_host, parse_hos
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import config_home
 from dora_systemd.trust.files import read_file
-from dora_systemd.trust.paths import exists
+from dora_systemd.trust.paths import exists, hint_of_changeable
 
 SYSTEM_HOSTS = Path("/etc/dora-systemd/hosts")
 USER_HOSTS = Path("dora-systemd/hosts")
@@ -46,9 +46,8 @@ def _read(path: Path) -> str:
     """Its text. Root logs in where only root has said so."""
     text = read_file(path)
     if os.geteuid() == 0 and (reason := text.place.changeable):
-        hint = f"name the hosts on the command line, or list them in {SYSTEM_HOSTS}"
-        if path == SYSTEM_HOSTS:
-            hint = f"chown root: {path}; chmod go-w {path}"
+        instead = f"name the hosts on the command line, or list them in {SYSTEM_HOSTS}"
+        hint = hint_of_changeable(path, SYSTEM_HOSTS, instead)
         raise DoraSystemdError(f"cannot use {path}: {reason}", hint, ExitCode.NO_PERMISSION)
     return decoded(text.data, path)
 

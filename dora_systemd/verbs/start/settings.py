@@ -13,7 +13,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope, config_home
 from dora_systemd.trust.files import read_file
-from dora_systemd.trust.paths import Place, exists
+from dora_systemd.trust.paths import Place, exists, hint_of_changeable
 from dora_systemd.values import shown
 
 SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
@@ -160,9 +160,9 @@ def _check_trust(read: SettingsFile) -> None:
 
 
 def _untrusted(read: SettingsFile, key: str, flag: str) -> DoraSystemdError:
-    hint = f"give {flag} on the command line, or set it in {SYSTEM_FILE}"
-    if read.path == SYSTEM_FILE:
-        hint = f"chown root: {SYSTEM_FILE}; chmod go-w {SYSTEM_FILE}"
-    message = f"{key} is set there, and {read.place.changeable}"
-    message = f"cannot use {shown(str(read.path))}: {message}"
-    return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
+    instead = f"give {flag} on the command line, or set it in {SYSTEM_FILE}"
+    return DoraSystemdError(
+        f"cannot use {shown(str(read.path))}: {key} is set there, and {read.place.changeable}",
+        hint_of_changeable(read.path, SYSTEM_FILE, instead),
+        ExitCode.NO_PERMISSION,
+    )
