@@ -33,7 +33,7 @@ from dora_systemd.errors import ExitCode
 from dora_systemd.values import format_rounded_size
 from dora_systemd.verbs.releases.send import Packed, packed
 from dora_systemd.verbs.remote.talk import Ended, Said, Talks
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 
 SILENCE_SECONDS = 600.0
 """After which a host is given up that says nothing and takes nothing: its doractl hangs, or its

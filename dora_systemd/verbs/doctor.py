@@ -49,10 +49,11 @@ from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_dire
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.releases.listing import judge_releases
-from dora_systemd.verbs.start.account import DEFAULT_USER
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.logins import PASSWD, is_lingering, judge_logins, linger_command
-from dora_systemd.verbs.start.settings import check_config, config_files
+from dora_systemd.verbs.start.read import config_files
+from dora_systemd.verbs.start.settings import check_config
+from dora_systemd.verbs.start.where import DEFAULT_USER
 
 JOURNALD = "systemd-journald.service"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.verbs.start.account import DEFAULT_USER
+from dora_systemd.verbs.start.where import DEFAULT_USER
 from tests.system.cells import Cell, Project, command_line, run, wait_for
 
 TICK = "inputs: {tick: dora/timer/millis/50}"

@@ -14,7 +14,7 @@ from dora_systemd.decisions.gateway.place import SERVICE_UNIT
 from dora_systemd.decisions.properties.sandbox import NETWORKS
 from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.start.account import DEFAULT_USER
+from dora_systemd.verbs.start.where import DEFAULT_USER
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 from tests.system.gateways import Front
 from tests.system.refusals import Refusal, check_refusals

@@ -15,7 +15,8 @@ import pytest
 
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.plan import Plan, make_plan
+from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.start.unit import format_plan
 from tests.system.cells import run, wait_for
 from tests.system.homes import FLOW, Home

@@ -34,7 +34,7 @@ from dora_systemd.verbs.releases.deploy import (
 )
 from dora_systemd.verbs.releases.receive import compare_sent, receive
 from dora_systemd.verbs.start.logins import ensure_linger, logout_note
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest
+from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest
 
 _INPUT = 0
 _SIGNS = {"added": "+", "changed": "~", "removed": "-"}

@@ -28,7 +28,7 @@ from dora_systemd.verbs.machines.member import (
     start_member,
 )
 from dora_systemd.verbs.machines.push import place_problem
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.version import own_facts
 
 _FORCED = "dora_systemd.member.forced"

@@ -19,7 +19,8 @@ from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.decisions.logs.records import DORA_LEVELS, RAW, LogFilter, parse_filter
 from dora_systemd.names import unit_name
 from dora_systemd.verbs.start.enable import drop_unit_files
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
+from dora_systemd.verbs.start.plan import make_plan
+from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest, request_name
 from dora_systemd.verbs.start.restart_ended import note_start
 from dora_systemd.verbs.start.run import attached_properties, life_line
 from dora_systemd.verbs.start.start import make_room, refuse_unit_file, require_free_name

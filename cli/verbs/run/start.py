@@ -32,7 +32,8 @@ from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.logins import ensure_linger, has_run_here, logout_note, start_notes
 from dora_systemd.verbs.start.needs import held_notes, waiting_notes
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
+from dora_systemd.verbs.start.plan import make_plan
+from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest, request_name
 from dora_systemd.verbs.start.restart_ended import find_start, means_name
 from dora_systemd.verbs.start.start import Claim, claim, require_free_name
 from dora_systemd.verbs.start.start_unit import Started, format_started, start_unit

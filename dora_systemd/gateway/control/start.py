@@ -28,7 +28,7 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import shown
 from dora_systemd.verbs.facts.nodes import written_dataflow
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.start.start import claim
 from dora_systemd.verbs.start.start_unit import start_unit
 

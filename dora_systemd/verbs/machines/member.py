@@ -47,7 +47,8 @@ from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
 from dora_systemd.verbs.start.enable import drop_unit_files
 from dora_systemd.verbs.start.logins import is_lingering, linger_command
-from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.plan import Plan, make_plan
+from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.start.start import make_room, refuse_unit_file, require_free_name
 from dora_systemd.verbs.start.unit import plan_properties, systemd_number
 

@@ -22,7 +22,8 @@ from dora_systemd.trust.paths import exists
 from dora_systemd.trust.programs import own_account
 from dora_systemd.values import quoted, shown
 from dora_systemd.verbs.machines.probe import Probe, probe_as_caller, probe_as_link, run_there
-from dora_systemd.verbs.start.settings import config_file, key_place, read_config
+from dora_systemd.verbs.start.read import config_file, key_place
+from dora_systemd.verbs.start.settings import read_config
 from dora_systemd.verbs.version import own_facts
 
 _INSTALL = (

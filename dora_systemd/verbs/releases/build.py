@@ -53,8 +53,8 @@ from dora_systemd.verbs.releases.files import copy_files
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source
 from dora_systemd.verbs.releases.trial import Standing, remains
-from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import beside_properties, exec_start
+from dora_systemd.verbs.start.where import account_of
 
 _LIBEXEC = str(Path(__file__).parents[2] / "libexec/builds")
 _LOOK_SECONDS = 0.2

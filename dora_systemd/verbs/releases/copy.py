@@ -24,7 +24,7 @@ from dora_systemd.verbs.releases.files import copy_files, find_files
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source
 from dora_systemd.verbs.releases.trial import Standing
-from dora_systemd.verbs.start.account import account_of
+from dora_systemd.verbs.start.where import account_of
 
 _MICROSECOND_NS = 1000
 

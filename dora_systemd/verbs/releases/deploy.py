@@ -43,12 +43,13 @@ from dora_systemd.verbs.releases.trial import (
     read_standing,
     require_deployable,
 )
-from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
-from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.plan import Plan, make_plan
+from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.start.start import require_same_user
 from dora_systemd.verbs.start.unit import plan_properties
+from dora_systemd.verbs.start.where import account_of
 
 _COMMAND = "doractl deploy"
 BUILD_TIMEOUT = 30 * 60 * SECOND

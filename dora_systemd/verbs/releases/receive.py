@@ -31,7 +31,6 @@ from dora_systemd.decisions.settings.table import USER, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.trust.files import read_file
 from dora_systemd.verbs.facts.locks import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.copy import newest
 from dora_systemd.verbs.releases.deploy import (
@@ -44,9 +43,10 @@ from dora_systemd.verbs.releases.listing import root_of, store_of
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source, find_source
 from dora_systemd.verbs.releases.trial import read_standing, require_deployable
-from dora_systemd.verbs.start.account import choose_user
-from dora_systemd.verbs.start.plan import StartRequest
-from dora_systemd.verbs.start.settings import read_settings
+from dora_systemd.verbs.start.read import read_files
+from dora_systemd.verbs.start.request import StartRequest
+from dora_systemd.verbs.start.settings import settings_of
+from dora_systemd.verbs.start.where import choose_user
 
 Warn = Callable[[str], None]
 
@@ -188,10 +188,11 @@ def _source(
     if parcel.directory is not None:
         directory = draft.tree / parcel.directory
         flags[WORKING_DIRECTORY.name] = str(directory)
-    settings = read_settings(scope, path, flags, request.start.environment)
-    user = choose_user(scope, settings[USER], read_file(path).place, str(directory))
-    draft.lend(None if user is None else user.pw_gid)
     start = replace(request.start, dataflow=str(path), name=parcel.name, flags=flags)
+    files = read_files(start)
+    wanted = settings_of(scope, files, start)[USER]
+    user = choose_user(scope, wanted, files.place, str(directory))
+    draft.lend(None if user is None else user.pw_gid)
     source = find_source(scope, start, bool(request.build_timeout))
     # All that was sent, whatever the rules about files here say.
     named = tuple(parcel.files)

@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.adapters.releases.transfer import Spool, spooled
-from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.releases.entries import Found, Stored, refusal
 from dora_systemd.decisions.releases.parcel import Parcel
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
@@ -18,19 +19,17 @@ from dora_systemd.decisions.settings.table import ENV_FILE, VENV, WORKING_DIRECT
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
+from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import Place, exists, reached, user_name
 from dora_systemd.trust.programs import Account
 from dora_systemd.trust.project import opened_project
 from dora_systemd.values import format_rounded_size, shown
 from dora_systemd.verbs.releases.files import copy_files, find_files
-from dora_systemd.verbs.releases.source import named_paths, project_root, read_dataflow
-from dora_systemd.verbs.start.account import DEFAULT_USER, account_of, choose_user
-from dora_systemd.verbs.start.plan import StartRequest, request_name
-from dora_systemd.verbs.start.settings import (
-    SettingsFile,
-    read_settings_file,
-    require_modest,
-)
+from dora_systemd.verbs.releases.source import named_paths, project_file, project_root
+from dora_systemd.verbs.start.read import SettingsFile, read_beside
+from dora_systemd.verbs.start.request import StartRequest, request_name
+from dora_systemd.verbs.start.settings import require_modest
+from dora_systemd.verbs.start.where import DEFAULT_USER, account_of, choose_user
 
 _NO_PLACE = "/dev/null"
 """No file can be below it."""
@@ -103,17 +102,17 @@ def packed(
 
 
 def _find(request: StartRequest) -> Sender:
-    path, written, dataflow = read_dataflow(request)
-    beside = Path(settings_path(str(path)))
-    read = read_settings_file(beside) if exists(beside) else None
+    path = project_file(request)
+    written, read = read_file(path), read_beside(path)
     if read:
         _require_trusted(read)
-    documents = [(str(beside), read.document)] if read else []
+    documents = [(str(read.path), read.document)] if read else []
     settings = resolve_settings(request.flags, {}, documents)
     given = settings[WORKING_DIRECTORY]
     directory = "" if given is None else os.path.normpath(Path(given).absolute())
     root = project_root(path, directory or str(path.parent))
     said = read.data if read else None
+    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
     return Sender(written.place, dataflow, settings, root, directory, said)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
-from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.releases.build import built_nodes, has_builds, is_moving, lock_places
 from dora_systemd.decisions.releases.entries import refusal
@@ -14,12 +14,14 @@ from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
-from dora_systemd.trust.files import Text, read_file
+from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import Place, exists, is_directory
 from dora_systemd.trust.sight import Sight, sight_of
 from dora_systemd.values import shown
-from dora_systemd.verbs.start.account import account_of
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan, path_of
+from dora_systemd.verbs.start.plan import Plan, make_plan
+from dora_systemd.verbs.start.read import read_files
+from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest, path_of
+from dora_systemd.verbs.start.where import account_of
 
 
 @dataclass(frozen=True)
@@ -66,23 +68,24 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
 
     want_build: what it needs is built in the release. Raises DoraSystemdError.
     """
-    path, written, dataflow = read_dataflow(request)
-    plan = make_plan(scope, replace(request, dataflow=str(path), is_unbuilt=want_build))
+    path = project_file(request)
+    wanted = replace(request, dataflow=str(path), is_unbuilt=want_build)
+    files = read_files(wanted)
+    plan, dataflow = make_plan(scope, wanted, files), files.dataflow()
     directory = plan.options.working_directory
     root = project_root(path, directory)
     _check(plan, dataflow, root, want_build)
     environment_files = plan.settings[ENV_FILE]
     named = named_paths(dataflow, directory, root, environment_files)
-    beside = settings_path(str(path))
-    settings = read_file(beside) if exists(beside) else None
-    origin = _origin(written.place, settings and settings.place)
+    beside = files.beside
+    origin = beside.place if beside and beside.place.changeable else files.place
     read: dict[str, bytes | None] = {
         os.path.relpath(one, root): read_file(one).data
         for one in environment_files
         if _is_below(os.path.normpath(one), root) and one not in plan.settings.lent
     }
-    read[os.path.relpath(path, root)] = written.data
-    read[os.path.relpath(beside, root)] = settings and settings.data
+    read[os.path.relpath(path, root)] = files.text.data
+    read[os.path.relpath(settings_path(str(path)), root)] = beside.data if beside else None
     builders = find_builders(plan, dataflow, root) if want_build else ("", "")
     if plan.missing and not any(builders):
         raise plan.missing
@@ -90,17 +93,11 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
     return Source(root, origin, plan, named, read, *builders, is_moving=moves)
 
 
-def read_dataflow(request: StartRequest) -> tuple[Path, Text, Dataflow]:
-    """The dataflow file that `request` names, itself or by its directory: its path and content.
-
-    Raises DoraSystemdError.
-    """
+def project_file(request: StartRequest) -> Path:
+    """The dataflow file that `request` names, itself or by its directory."""
     path = path_of(request)
     path = path / DEFAULT_FILE if is_directory(path) else path
-    path = Path(os.path.normpath(path))
-    written = read_file(path)
-    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
-    return path, written, dataflow
+    return Path(os.path.normpath(path))
 
 
 def named_paths(
@@ -163,13 +160,6 @@ def source_notes(source: Source, tree: Path) -> Iterator[str]:
     """What people have to know about a release of this project in `tree`."""
     if (venv := source.plan.options.venv) and not own_venv(source, tree):
         yield f"all releases share the virtual environment {shown(venv)}: pip changes all of them"
-
-
-def _origin(place: Place, settings: Place | None) -> Place:
-    """The place of the dataflow file; that of the settings file beside it if that is not root's."""
-    if settings is None:
-        return place
-    return settings if settings.changeable else place
 
 
 def project_root(path: Path, directory: str) -> str:

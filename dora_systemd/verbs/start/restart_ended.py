@@ -26,7 +26,8 @@ from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 
 if TYPE_CHECKING:
-    from dora_systemd.verbs.start.plan import Plan, StartRequest
+    from dora_systemd.verbs.start.plan import Plan
+    from dora_systemd.verbs.start.request import StartRequest
 
 EVENT = "start-asked"
 COMMITTED = "release-committed"

@@ -1,72 +1,36 @@
-"""Reads the settings of a dataflow that is to be started, and checks whose files to trust."""
+"""Resolves the settings of a start, and checks whose files may say what they say."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-from dora_systemd.adapters.host.files import decoded, find_line, parse_yaml
+from dora_systemd.adapters.host.files import decoded, find_line
 from dora_systemd.decisions.cell.rights import BY_KEY
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
-from dora_systemd.names import settings_path
-from dora_systemd.scope import Scope, config_home
-from dora_systemd.trust.files import read_file
-from dora_systemd.trust.paths import Place, exists, hint_of_changeable
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import hint_of_changeable
 from dora_systemd.values import shown
-
-SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
-USER_FILE = Path("dora-systemd/config.yml")
-
-
-@dataclass(frozen=True)
-class SettingsFile:
-    """A settings file that was read: its content, and its place."""
-
-    path: Path
-    place: Place
-    data: bytes
-    document: object
-
-    @property
-    def is_roots(self) -> bool:
-        """Whether only root can have written and placed the file."""
-        return not self.place.changeable
-
-    def words(self) -> Mapping[object, object]:
-        """Its keys."""
-        return self.document if isinstance(self.document, dict) else {}
+from dora_systemd.verbs.start.read import (
+    SYSTEM_FILE,
+    Files,
+    SettingsFile,
+    read_general,
+    read_settings_file,
+)
+from dora_systemd.verbs.start.request import StartRequest
 
 
-def settings_files(dataflow: Path, environment: Mapping[str, str]) -> list[Path]:
-    """The settings files that may exist, highest precedence first."""
-    return [Path(settings_path(str(dataflow))), *config_files(environment)]
+def settings_of(scope: Scope, files: Files, request: StartRequest) -> Settings:
+    """The settings from the flags and variables of a request, and from files.
 
-
-def config_files(environment: Mapping[str, str]) -> list[Path]:
-    """The settings files for all dataflows that may exist, highest precedence first."""
-    config = config_home(environment)
-    return [*([Path(config) / USER_FILE] if config else []), SYSTEM_FILE]
-
-
-def read_settings(
-    scope: Scope,
-    dataflow: Path,
-    flags: Mapping[str, object],
-    environment: Mapping[str, str],
-    origin: Place | None = None,
-) -> Settings:
-    """The settings from flags, variables and files. Raises DoraSystemdError.
-
-    dataflow: its absolute path. In system scope, another user's file may only contain what that
-    user may decide, and the environment files that it names are `lent`: read as that user.
-    origin: of a release, the place of the original dataflow file, which counts for the settings
-    file that was copied with it.
+    In system scope, another user's file may only contain what that user may decide, and the
+    environment files that it names are `lent`: read as that user. Raises DoraSystemdError.
     """
-    beside, *elsewhere = settings_files(dataflow, environment)
-    found = [read_settings_file(beside, origin)] if exists(beside) else []
-    found += [read_settings_file(path) for path in elsewhere if exists(path)]
+    flags, environment = request.flags, request.environment
+    found = [*([files.beside] if files.beside else []), *files.general]
     others = [] if scope.is_user else [one for one in found if not one.is_roots]
     for one in others:
         require_modest(one)
@@ -92,19 +56,9 @@ def _resolved(
         raise error.at_line(find_line(text, error.place)) from error
 
 
-def config_file(scope: Scope, environment: Mapping[str, str]) -> Path:
-    """The settings file for all dataflows of the scope; it need not exist."""
-    return config_files(environment)[0] if scope.is_user else SYSTEM_FILE
-
-
-def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
-    """The directory with the keys of machines, one file each; it need not exist."""
-    return config_file(scope, environment).parent / "ssh"
-
-
 def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
     """The settings for all dataflows. Raises DoraSystemdError."""
-    found = [read_settings_file(one) for one in config_files(environment) if exists(one)]
+    found = read_general(environment)
     for one in found:
         if not scope.is_user and not one.is_roots:
             _check_trust(one)
@@ -123,13 +77,6 @@ def require_modest(read: SettingsFile) -> None:
     """Raise DoraSystemdError for what a settings file may not say that is not the caller's."""
     _check_trust(read)
     _check_values(read)
-
-
-def read_settings_file(path: Path, origin: Place | None = None) -> SettingsFile:
-    """One settings file. origin: of a copy. Raises DoraSystemdError (BAD_INPUT)."""
-    text = read_file(path)
-    document = parse_yaml(decoded(text.data, path), path, allow_empty=True)
-    return SettingsFile(path, origin or text.place, text.data, document)
 
 
 def _check_values(read: SettingsFile) -> None:

@@ -36,7 +36,8 @@ from dora_systemd.verbs.start.enable import (
     release_transient,
     wait_until_forgotten,
 )
-from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
+from dora_systemd.verbs.start.plan import Plan, make_plan
+from dora_systemd.verbs.start.request import StartRequest, request_name
 from dora_systemd.verbs.start.restart_ended import Asked, note_start
 from dora_systemd.verbs.start.start_unit import start_unit
 from dora_systemd.verbs.start.unit import plan_links, plan_properties, systemd_number

@@ -19,12 +19,12 @@ from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, drop_unsup
 from dora_systemd.paths import CellPaths
 from dora_systemd.trust.paths import exists
 from dora_systemd.values import quoted
-from dora_systemd.verbs.start.find_files import credential_files
 from dora_systemd.verbs.start.limits import check_limits
 from dora_systemd.verbs.start.needs import Needy, check_needs, clock_service, needs_warnings
 from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.read import key_place
 from dora_systemd.verbs.start.sandbox import sandbox_warnings
-from dora_systemd.verbs.start.settings import key_place
+from dora_systemd.verbs.start.startable import credential_files
 
 if TYPE_CHECKING:
     from dora_systemd.decisions.machines.link_unit import LinkUnit

@@ -15,7 +15,7 @@ from dora_systemd.verbs.facts.enabled import trial_path
 from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy
 from dora_systemd.verbs.releases.listing import read_releases, store_of
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 from tests.unit.fakes.manager import ScopeIn
 from tests.unit.fakes.programs import make_dora
 from tests.unit.verbs.start.test_check import CheckingManager

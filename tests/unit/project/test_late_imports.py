@@ -101,7 +101,7 @@ LATE = {
     },
     "most dataflows run on one machine and have no releases, and most links are not lost": {
         "cli.foreground": {"verbs.facts.machines", "verbs.remote.attached"},
-        "verbs.start.plan": {
+        "verbs.start.where": {
             *("adapters.host.addresses", "adapters.host.watch"),
             "decisions.machines.spread",
         },

@@ -19,7 +19,7 @@ from dora_systemd.decisions.settings.schema import validate_settings
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.decisions.why.remedies import known_remedy
 from dora_systemd.errors import ExitCode
-from dora_systemd.verbs.start.settings import SYSTEM_FILE
+from dora_systemd.verbs.start.read import SYSTEM_FILE
 from tests.unit.checkout import CHECKOUT
 from tests.unit.tools import require
 

@@ -12,7 +12,7 @@ from dora_systemd.adapters.releases.store import store_root
 from dora_systemd.decisions.unit.file import HEADER
 from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION
 from dora_systemd.names import SLICE
-from dora_systemd.verbs.start.account import DEFAULT_USER
+from dora_systemd.verbs.start.where import DEFAULT_USER
 from tests.unit.checkout import CHECKOUT
 
 PACKAGING = CHECKOUT / "packaging"

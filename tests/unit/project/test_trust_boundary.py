@@ -52,7 +52,8 @@ _TABLE = {
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh cli.main
         cli.edge cli.verbs.look.logs decisions.cell.launch verbs.inhibit
-        verbs.machines.member verbs.machines.push verbs.start.find_files verbs.start.limits
+        verbs.machines.member verbs.machines.push verbs.start.limits verbs.start.startable
+        verbs.start.where
     """,
     KERNEL: """
         adapters.cgroup.groups

@@ -15,7 +15,7 @@ from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.start.find_files import check_credentials, credential_files
+from dora_systemd.verbs.start.startable import check_credentials, credential_files
 from tests.unit.fakes.manager import options
 
 USER = Scope(is_user=True, uid=os.getuid())

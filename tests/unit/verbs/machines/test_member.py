@@ -16,7 +16,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.machines import member
 from dora_systemd.verbs.machines.member import MemberRequest, is_passing, start_member
-from dora_systemd.verbs.start.plan import Plan, StartRequest
+from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.request import StartRequest
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 OTHER = UUID.replace("5", "6")

@@ -30,7 +30,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     fake_ssh(monkeypatch, tmp_path, f"echo '{said}' | sed \"s/: 0}}/: $(date +%s%6N)}}/\"")
     make_dora(tmp_path / "bin/dora", "1.1.0")
     monkeypatch.delenv("VIRTUAL_ENV", raising=False)
-    monkeypatch.setattr("dora_systemd.verbs.start.settings.SYSTEM_FILE", tmp_path / "none")
+    monkeypatch.setattr("dora_systemd.verbs.start.read.SYSTEM_FILE", tmp_path / "none")
     return tmp_path
 
 

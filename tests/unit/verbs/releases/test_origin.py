@@ -1,6 +1,7 @@
 """Root does not believe a copy more than the original, although the copy is root's."""
 
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,8 +9,10 @@ import pytest
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import Place
-from dora_systemd.verbs.start.plan import StartRequest, make_plan
-from dora_systemd.verbs.start.settings import read_settings
+from dora_systemd.verbs.start.plan import make_plan
+from dora_systemd.verbs.start.read import read_files
+from dora_systemd.verbs.start.request import StartRequest
+from dora_systemd.verbs.start.settings import settings_of
 
 SYSTEM = Scope(is_user=False, uid=0)
 RELEASE = "dora-systemd/releases/robot/20261121T220012/tree"
@@ -18,11 +21,15 @@ RELEASE = "dora-systemd/releases/robot/20261121T220012/tree"
 def test_the_owner_of_the_original_counts(tmp_path: Path) -> None:
     (tmp_path / "dataflow.systemd.yml").write_text("user: root\n")
     hers = Place("/home/eve/dataflow.yml", 1000, stat.S_IFREG | 0o644, frozenset({0, 1000}))
+    flow = tmp_path / "dataflow.yml"
+    flow.write_text("nodes: []\n")
+    copy = StartRequest(str(flow), origin=hers)
     with pytest.raises(DoraSystemdError, match="user is set there") as caught:
-        read_settings(SYSTEM, tmp_path / "dataflow.yml", {}, {}, hers)
+        settings_of(SYSTEM, read_files(copy), copy)
     assert caught.value.code is ExitCode.NO_PERMISSION
     roots = hers._replace(uid=0, owners=frozenset({0}))
-    settings = read_settings(SYSTEM, tmp_path / "dataflow.yml", {}, {}, roots)
+    copy = replace(copy, origin=roots)
+    settings = settings_of(SYSTEM, read_files(copy), copy)
     assert "root" in settings.values.values()
 
 

@@ -28,7 +28,7 @@ from dora_systemd.verbs.releases.receive import (
     _require_user,
     _source,
 )
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 from tests.unit.fakes.deploys import FLOW
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.verbs.releases.test_trial import NEW as NEW_ID

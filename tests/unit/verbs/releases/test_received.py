@@ -17,7 +17,7 @@ from dora_systemd.values import SECOND
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.receive import receive
 from dora_systemd.verbs.releases.rollback import roll_back
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 from tests.unit.fakes.deploys import FLOW, Bench
 from tests.unit.fakes.manager import options
 

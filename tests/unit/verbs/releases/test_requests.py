@@ -28,7 +28,7 @@ from dora_systemd.verbs.releases.listing import (
 from dora_systemd.verbs.releases.rollback import deployed_name, roll_back
 from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.releases.trial import read_standing
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import UUID, FakeManager
 from tests.unit.fakes.notes import Notes

@@ -11,7 +11,7 @@ from dora_systemd.decisions.releases.parcel import Parcel
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import Account, own_account
 from dora_systemd.verbs.releases import send
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 
 FLOW = "nodes: [{id: a, path: a.py}]\n"
 MODEST, IMMODEST = "restart_policy: always\n", "user: root\n"

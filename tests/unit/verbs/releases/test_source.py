@@ -8,7 +8,7 @@ from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.source import Source, find_source, named_paths, require_same
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.request import StartRequest
 from tests.unit.fakes.programs import make_program
 
 USER = Scope(is_user=True, uid=1000)

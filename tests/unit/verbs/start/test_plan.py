@@ -14,6 +14,7 @@ import pytest
 from dora_systemd.adapters.dora.check import check_access
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS, UV
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -21,17 +22,12 @@ from dora_systemd.trust.paths import Place, reached
 from dora_systemd.trust.sight import LentSight, Sight, sight_of
 from dora_systemd.verbs.facts.nodes import named_places
 from dora_systemd.verbs.releases.source import find_source
-from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.check import check_plan
-from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
-from dora_systemd.verbs.start.settings import (
-    SYSTEM_FILE,
-    check_config,
-    read_settings,
-    read_settings_file,
-    require_modest,
-    settings_files,
-)
+from dora_systemd.verbs.start.plan import Plan, make_plan
+from dora_systemd.verbs.start.read import SYSTEM_FILE, config_files, read_files, read_settings_file
+from dora_systemd.verbs.start.request import StartRequest, request_name
+from dora_systemd.verbs.start.settings import check_config, require_modest, settings_of
+from dora_systemd.verbs.start.where import account_of, choose_user
 from tests.unit.fakes.programs import make_dora, make_program
 
 USER = Scope(is_user=True, uid=os.getuid())
@@ -177,18 +173,21 @@ def test_names() -> None:
         request_name(StartRequest("/x/y.yml", "../robot"))
 
 
-def test_settings_files(tmp_path: Path) -> None:
-    flow = tmp_path / "robot.yml"
+def settings(scope: Scope, flow: Path, flags: dict[str, object] | None = None) -> Settings:
+    request = StartRequest(str(flow), None, flags or {})
+    return settings_of(scope, read_files(request), request)
+
+
+def test_settings_files() -> None:
     home = {"HOME": "/home/alice"}
-    beside, user, system = settings_files(flow, home)
-    assert beside == tmp_path / "robot.systemd.yml"
+    user, system = config_files(home)
     assert user == Path("/home/alice/.config/dora-systemd/config.yml")
     assert system == Path("/etc/dora-systemd/config.yml")
-    config = settings_files(flow, {**home, "XDG_CONFIG_HOME": "/c"})[1]
+    config = config_files({**home, "XDG_CONFIG_HOME": "/c"})[0]
     assert config == Path("/c/dora-systemd/config.yml")
-    assert settings_files(flow, {}) == [beside, system]
+    assert config_files({}) == [system]
     # A relative path in the variable is not valid.
-    assert settings_files(flow, {**home, "XDG_CONFIG_HOME": "c"})[1] == user
+    assert config_files({**home, "XDG_CONFIG_HOME": "c"})[0] == user
 
 
 @pytest.mark.parametrize(
@@ -206,7 +205,7 @@ def test_a_wrong_key_is_named_with_its_line(project: Path, text: str, words: str
     path = project / "robot.systemd.yml"
     path.write_text(text)
     with pytest.raises(DoraSystemdError) as caught:
-        read_settings(USER, project / "robot.yml", {}, {})
+        settings(USER, project / "robot.yml")
     assert caught.value.message.endswith(words)
     with pytest.raises(DoraSystemdError, match="at line "):
         check_config(USER, path)
@@ -214,8 +213,8 @@ def test_a_wrong_key_is_named_with_its_line(project: Path, text: str, words: str
 
 def test_settings_beside_the_dataflow(project: Path) -> None:
     (project / "robot.systemd.yml").write_text("uv: yes\n")
-    assert read_settings(USER, project / "robot.yml", {}, {})[UV] is True
-    assert read_settings(USER, project / "robot.yml", {"uv": False}, {})[UV] is False
+    assert settings(USER, project / "robot.yml")[UV] is True
+    assert settings(USER, project / "robot.yml", {"uv": False})[UV] is False
 
 
 ROOT_ONLY = {
@@ -239,16 +238,16 @@ def test_which_settings_are_for_root_only() -> None:
 def test_whom_to_believe(project: Path, key: str) -> None:
     beside = project / "robot.systemd.yml"
     beside.write_text(f"{key}: {ROOT_ONLY[key]}\n")
-    read_settings(SYSTEM, project / "robot.yml", {}, {})
+    settings(SYSTEM, project / "robot.yml")
     os.chown(beside, 65534, 65534)
-    read_settings(USER, project / "robot.yml", {}, {})
+    settings(USER, project / "robot.yml")
     with pytest.raises(DoraSystemdError) as caught:
-        read_settings(SYSTEM, project / "robot.yml", {}, {})
+        settings(SYSTEM, project / "robot.yml")
     assert caught.value.code is ExitCode.NO_PERMISSION
     os.chown(beside, 0, 0)
     os.chown(project, 65534, 65534)
     with pytest.raises(DoraSystemdError, match="nobody owns a directory above it"):
-        read_settings(SYSTEM, project / "robot.yml", {}, {})
+        settings(SYSTEM, project / "robot.yml")
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="its files are root's")
@@ -264,7 +263,7 @@ def test_a_settings_file_that_others_can_write(
     if not is_refused:
         check_config(SYSTEM, beside)
         return
-    for read in (lambda: read_settings(SYSTEM, project / "robot.yml", {}, {}),
+    for read in (lambda: settings(SYSTEM, project / "robot.yml"),
                  lambda: check_config(SYSTEM, beside)):  # fmt: skip
         with pytest.raises(DoraSystemdError) as caught:
             read()
@@ -309,14 +308,14 @@ RAISING = {
 def test_rights_that_only_root_gives(project: Path, text: str) -> None:
     beside = project / "robot.systemd.yml"
     beside.write_text(text)
-    read_settings(SYSTEM, project / "robot.yml", {}, {})
+    settings(SYSTEM, project / "robot.yml")
     os.chown(beside, 65534, 65534)
-    read_settings(USER, project / "robot.yml", {}, {})
+    settings(USER, project / "robot.yml")
     if not RAISING[text]:
-        read_settings(SYSTEM, project / "robot.yml", {}, {})
+        settings(SYSTEM, project / "robot.yml")
         return
     with pytest.raises(DoraSystemdError) as caught:
-        read_settings(SYSTEM, project / "robot.yml", {}, {})
+        settings(SYSTEM, project / "robot.yml")
     assert caught.value.message == (
         f"cannot use {beside}: {RAISING[text]} is set there, and the file is not root's"
     )
@@ -329,12 +328,12 @@ def test_rights_that_only_root_gives(project: Path, text: str) -> None:
 def test_environment_files_of_others_are_lent(project: Path) -> None:
     flow, beside = project / "robot.yml", project / "robot.systemd.yml"
     beside.write_text("env_file: [/a, /b]\n")
-    assert not read_settings(SYSTEM, flow, {}, {}).lent
+    assert not settings(SYSTEM, flow).lent
     os.chown(beside, 65534, 65534)
-    settings = read_settings(SYSTEM, flow, {"env_file": ("/b", "/c")}, {})
-    assert settings[ENV_FILE] == ("/a", "/b", "/b", "/c")
-    assert settings.lent == {"/a"}
-    assert not read_settings(USER, flow, {}, {}).lent
+    found = settings(SYSTEM, flow, {"env_file": ("/b", "/c")})
+    assert found[ENV_FILE] == ("/a", "/b", "/b", "/c")
+    assert found.lent == {"/a"}
+    assert not settings(USER, flow).lent
 
 
 def place_of(path: Path) -> Place:

@@ -12,7 +12,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.start.plan import Plan, StartRequest
+from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.start.restart_ended import (
     Asked,
     find_known,

@@ -1,0 +1,124 @@
+"""Reads the files of a start, each once, with who could have written it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import release_of, settings_path
+from dora_systemd.scope import Scope, config_home
+from dora_systemd.trust.files import Text, read_file
+from dora_systemd.trust.paths import Place, exists
+from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest, path_of, request_name
+
+SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
+USER_FILE = Path("dora-systemd/config.yml")
+
+
+@dataclass(frozen=True)
+class SettingsFile:
+    """A settings file that was read: its content, and its place."""
+
+    path: Path
+    place: Place
+    data: bytes
+    document: object
+
+    @property
+    def is_roots(self) -> bool:
+        """Whether only root can have written and placed the file."""
+        return not self.place.changeable
+
+    def words(self) -> Mapping[object, object]:
+        """Its keys."""
+        return self.document if isinstance(self.document, dict) else {}
+
+
+@dataclass(frozen=True)
+class Files:
+    """The dataflow file and its settings files, as they were read."""
+
+    path: Path  # absolute, of the dataflow file
+    text: Text
+    place: Place  # of the file whose owner decides: the dataflow file, or the origin of a release
+    beside: SettingsFile | None  # that of this dataflow
+    general: tuple[SettingsFile, ...]  # those for all dataflows, highest precedence first
+
+    def dataflow(self) -> Dataflow:
+        """The dataflow, with modules as they are. Raises DoraSystemdError (BAD_INPUT)."""
+        document = parse_yaml(decoded(self.text.data, self.path), self.path)
+        return parse_dataflow(document, str(self.path))
+
+
+def read_files(request: StartRequest) -> Files:
+    """Read what a request names. Raises DoraSystemdError."""
+    path, origin = path_of(request), request.origin
+    request_name(request)
+    text = _read(path)
+    if origin is None:
+        _refuse_release(path)
+    beside = read_beside(path, origin)
+    return Files(path, text, origin or text.place, beside, read_general(request.environment))
+
+
+def _read(path: Path) -> Text:
+    """The dataflow file. Raises DoraSystemdError (BAD_INPUT)."""
+    try:
+        return read_file(path)
+    except DoraSystemdError as error:
+        if path.name != DEFAULT_FILE or exists(path):
+            raise
+        # Perhaps nobody has named it.
+        hint = "go to the directory of a dataflow, or name its file"
+        raise DoraSystemdError(error.message, hint, error.code) from error
+
+
+def _refuse_release(path: Path) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a file of a release.
+
+    It is root's, and what it says is not: root must not take settings from it as from its own.
+    """
+    if release := release_of(str(path)):
+        hint = f"doractl rollback NAME {release} runs that release"
+        message = f"cannot start {path}: it belongs to a release"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
+def read_beside(dataflow: Path, origin: Place | None = None) -> SettingsFile | None:
+    """The settings file of a dataflow, if there is one. Raises DoraSystemdError (BAD_INPUT).
+
+    origin: of a release, the place of the original dataflow file, which counts for the settings
+    file that was copied with it.
+    """
+    path = Path(settings_path(str(dataflow)))
+    return read_settings_file(path, origin) if exists(path) else None
+
+
+def read_general(environment: Mapping[str, str]) -> tuple[SettingsFile, ...]:
+    """The settings files for all dataflows, highest precedence first. Raises DoraSystemdError."""
+    return tuple(read_settings_file(one) for one in config_files(environment) if exists(one))
+
+
+def config_files(environment: Mapping[str, str]) -> list[Path]:
+    """The settings files for all dataflows that may exist, highest precedence first."""
+    config = config_home(environment)
+    return [*([Path(config) / USER_FILE] if config else []), SYSTEM_FILE]
+
+
+def config_file(scope: Scope, environment: Mapping[str, str]) -> Path:
+    """The settings file for all dataflows of the scope; it need not exist."""
+    return config_files(environment)[0] if scope.is_user else SYSTEM_FILE
+
+
+def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
+    """The directory with the keys of machines, one file each; it need not exist."""
+    return config_file(scope, environment).parent / "ssh"
+
+
+def read_settings_file(path: Path, origin: Place | None = None) -> SettingsFile:
+    """One settings file. origin: of a copy. Raises DoraSystemdError (BAD_INPUT)."""
+    text = read_file(path)
+    document = parse_yaml(decoded(text.data, path), path, allow_empty=True)
+    return SettingsFile(path, origin or text.place, text.data, document)

@@ -1,0 +1,56 @@
+"""What is asked for: the first stage of a start."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import name_from_path, parse_name
+from dora_systemd.trust.paths import Place
+from dora_systemd.values import shown
+
+DEFAULT_FILE = "dataflow.yml"
+
+
+@dataclass(frozen=True)
+class StartRequest:
+    """A request to start a dataflow.
+
+    machine, head, placed, addresses: of the runner's options, if this machine is a member of the
+    dataflow.
+    """
+
+    dataflow: str
+    name: str | None = None
+    flags: Mapping[str, object] = field(default_factory=dict)  # raw, by name of the setting
+    environment: Mapping[str, str] = field(default_factory=dict)  # the caller's variables
+    attached: bool = False  # the dataflow ends with the caller
+    uuid: str = ""  # of a dataflow that is started again
+    # of a release, the file that its dataflow file was copied from: who owns that decides, not
+    # root, who owns the copy
+    origin: Place | None = None
+    is_unbuilt: bool = False  # a build may make the programs of its nodes, see Plan.missing
+    machine: str = ""
+    head: str = ""
+    placed: tuple[Placed, ...] = ()
+    addresses: tuple[str, ...] = ()
+
+
+def request_name(request: StartRequest) -> str:
+    """The name of the dataflow. Raises DoraSystemdError (USAGE)."""
+    if request.name is not None:
+        return parse_name(request.name)
+    return name_from_path(str(path_of(request)))
+
+
+def path_of(request: StartRequest) -> Path:
+    """The absolute path that was asked for. Raises DoraSystemdError (BAD_INPUT) if it is empty."""
+    if not request.dataflow:  # not the working directory: a variable of a script is not set
+        raise DoraSystemdError("cannot read '': no path", "name a file", ExitCode.BAD_INPUT)
+    try:
+        return Path(request.dataflow).absolute()
+    except FileNotFoundError as error:
+        message = f"cannot read {shown(request.dataflow)}: the current directory was removed"
+        hint = "cd to a directory that exists"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT) from error

@@ -1,0 +1,281 @@
+"""Chooses the user that the nodes run as, and finds their programs with its permissions.
+
+Paths from another user's settings are only checked with that user's permissions: root must not
+reveal whether a file exists. Paths on root's own command line are also checked as root, which gives
+clearer errors.
+"""
+
+import os
+import pwd
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dora_systemd.adapters.dora.command import find_dora
+from dora_systemd.adapters.host.files import decoded, read_text
+from dora_systemd.decisions.cell.environment import unit_environment
+from dora_systemd.decisions.cell.environment_file import parse_environment_file
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.descriptor.expansion import called_variables
+from dora_systemd.decisions.settings.kinds import Setting
+from dora_systemd.decisions.settings.machines import MACHINES
+from dora_systemd.decisions.settings.resolve import Settings, with_settings
+from dora_systemd.decisions.settings.table import DORA, ENV, ENV_FILE, VENV, WORKING_DIRECTORY
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.trust.files import unreadable
+from dora_systemd.trust.paths import Place, reached, user_name
+from dora_systemd.trust.programs import Account, account_from
+from dora_systemd.trust.sight import Sight, cannot_reach
+from dora_systemd.values import quoted, shown
+from dora_systemd.verbs.start.read import Files
+from dora_systemd.verbs.start.request import StartRequest, request_name
+
+if TYPE_CHECKING:  # most dataflows run on one machine
+    from dora_systemd.decisions.machines.member import Member
+
+DEFAULT_USER = "dora"
+"""Runs the dataflows whose files belong to root; the package creates this user."""
+_MOST_DIGITS = 10  # of a uid
+_OWN = Sight()
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the user of the nodes sees of their programs."""
+
+    sight: Sight
+    settings: Settings
+    user: pwd.struct_passwd | None  # None: the caller, as itself
+
+    def find_venv(self, dataflow: str, environment: Mapping[str, str]) -> str | None:
+        """--venv, else the caller's VIRTUAL_ENV, else .venv beside the dataflow, else None."""
+        given = self.settings[VENV]
+        if given is not None:
+            return self._checked_venv(str(Path(given).absolute()))
+        places = [environment.get("VIRTUAL_ENV", ""), str(Path(dataflow).parent / ".venv")]
+        return next((one for one in places if one.startswith("/") and self._is_venv(one)), None)
+
+    def _checked_venv(self, venv: str) -> str:
+        if not self._is_venv(venv):
+            self._blame(VENV, f"{venv}/bin/python", _OWN.exists(f"{venv}/bin/python"))
+            raise DoraSystemdError(
+                f"cannot use {venv} as virtual environment: it has no bin/python",
+                f"python3 -m venv {venv}",
+                ExitCode.BAD_INPUT,
+            )
+        return venv
+
+    def _is_venv(self, venv: str) -> bool:
+        return self.sight.exists(f"{venv}/bin/python")
+
+    def check_reach(self, dataflow: str, directory: str) -> None:
+        """Raise DoraSystemdError for a working directory, or files, that the user cannot access."""
+        if not self.sight.is_directory(directory):
+            self._blame(WORKING_DIRECTORY, directory, _OWN.is_directory(directory))
+            raise no_directory(directory)
+        for path in (dataflow, __file__):
+            if self.user is not None and not self.sight.exists(path):
+                raise cannot_reach(self.user.pw_name, path)
+
+    def find_dora(self, venv: str | None, search_path: str) -> str:
+        """Absolute path of the dora command. Raises DoraSystemdError."""
+        is_given = self.settings.source(DORA) != "default"
+        given = self.settings[DORA] if is_given else None
+        try:
+            return find_dora(given, venv, search_path, self.sight)
+        except DoraSystemdError:
+            if not self._is_named_in_file(DORA):
+                self._blame(DORA, find_dora(given, None, search_path), is_there=True)
+            raise
+
+    def _blame(self, setting: Setting[Any], path: str, is_there: bool) -> None:
+        """Raise DoraSystemdError for a path that root can see and the user cannot."""
+        if self.user is not None and is_there and not self._is_named_in_file(setting):
+            raise cannot_reach(self.user.pw_name, path)
+
+    def _is_named_in_file(self, setting: Setting[Any]) -> bool:
+        return self.settings.source(setting).startswith("/")
+
+
+@dataclass(frozen=True)
+class Where:
+    """Who runs a dataflow, and from where."""
+
+    options: RunnerOptions  # with dora, venv and working directory
+    members: "tuple[Member, ...]"  # the other machines
+    environment: Mapping[str, str]  # all of Environment=
+
+
+def find_where(
+    scope: Scope,
+    request: StartRequest,
+    files: Files,
+    settings: Settings,
+    dataflow: Dataflow,
+    look: Look,
+) -> Where:
+    """Find programs and machines. Raises DoraSystemdError."""
+    path, directory = dataflow.source, working_directory(files, settings)
+    search_path = request.environment.get("PATH") or os.defpath
+    venv = look.find_venv(path, request.environment)
+    variables = _variables(settings, look.sight)
+    look.check_reach(path, directory)
+    options = RunnerOptions(
+        name=request_name(request),
+        uuid=request.uuid or str(uuid.uuid4()),
+        dataflow=path,
+        working_directory=directory,
+        dora=look.find_dora(venv, search_path),
+        venv=venv,
+        attached=request.attached,
+        env_keys=tuple(variables),
+        placed=request.placed,
+        machine=request.machine,
+        head=request.head,
+        addresses=request.addresses,
+    )
+    options = with_settings(options, settings)
+    if options.hot_reload:
+        # Imported late: few dataflows have it, and asyncio is slow to import.
+        from dora_systemd.adapters.host.watch import require_watcher
+
+        require_watcher()
+    options, members = _spread(dataflow, options, settings, variables)
+    # Root's variables are not for the file of another user, which could read them out.
+    is_own = scope.is_user or files.place.uid == os.geteuid()
+    called = called_variables(dataflow, request.environment if is_own else {})
+    environment = unit_environment(search_path, venv, {**called, **variables})
+    return Where(options, members, environment)
+
+
+def _spread(
+    dataflow: Dataflow, options: RunnerOptions, settings: Settings, variables: Mapping[str, str]
+) -> "tuple[RunnerOptions, tuple[Member, ...]]":
+    """The options of the runner here, and what other machines are told."""
+    is_spread = settings[MACHINES] or any("deploy" in node.raw for node in dataflow.nodes)
+    if not (options.machine or is_spread):
+        return options, ()
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.spread import part, spread
+
+    if options.machine:
+        return part(options, settings), ()
+    from dora_systemd.adapters.host.addresses import source_address
+
+    return spread(dataflow, options, settings, variables, os.uname().nodename, source_address)
+
+
+def _variables(settings: Settings, sight: Sight) -> dict[str, str]:
+    """The variables of --env and --env-file; --env has precedence, then the last file."""
+    variables: dict[str, str] = {}
+    for file in settings[ENV_FILE]:
+        text = _read_lent(file, sight) if file in settings.lent else read_text(Path(file))
+        variables |= parse_environment_file(text, file)
+    given = settings[ENV]
+    return {**variables, **given}
+
+
+def _read_lent(file: str, sight: Sight) -> str:
+    """An environment file of the user's own settings, read with that user's permissions."""
+    try:
+        return decoded(sight.read(file), Path(file))
+    except OSError as error:
+        raise unreadable(file, error) from error
+
+
+def working_directory(files: Files, settings: Settings) -> str:
+    """The absolute directory where relative paths begin."""
+    given = settings[WORKING_DIRECTORY]
+    return str(files.path.parent if given is None else Path(given).absolute())
+
+
+def choose_user(
+    scope: Scope, wanted: str | None, dataflow: Place, directory: str
+) -> pwd.struct_passwd | None:
+    """The user for User=, or None if everything runs as the manager's own user.
+
+    Default: the owner of the dataflow file that was read, or DEFAULT_USER if that is root.
+    directory: that of the programs. Raises DoraSystemdError.
+    """
+    if scope.is_user:
+        if wanted is not None:
+            raise DoraSystemdError(
+                "cannot choose the user of a dataflow with --user",
+                "leave --uid out, or use --system as root",
+                ExitCode.USAGE,
+            )
+        return None
+    if wanted is not None:
+        return _entry(wanted)
+    try:
+        with reached(directory) as (_, place):
+            check_identity(dataflow, place)
+    except OSError as error:
+        # Its owner could put it back after this, so what cannot be checked is refused. The words
+        # are those of Look.check_reach(): they do not tell what root can see.
+        raise no_directory(directory) from error
+    return _default_entry() if dataflow.uid == 0 else _owner_entry(dataflow.uid, dataflow.path)
+
+
+def no_directory(directory: str) -> DoraSystemdError:
+    """The error for a working directory that is none."""
+    message = f"cannot use {shown(directory)} as working directory: it is not a directory"
+    return DoraSystemdError(message, "correct --working-directory", ExitCode.BAD_INPUT)
+
+
+def account_of(user: pwd.struct_passwd | None) -> Account | None:
+    """The account to run children as; None: no change, as for all callers other than root."""
+    if user is None or os.geteuid() != 0:
+        return None
+    return account_from(user)
+
+
+def check_identity(dataflow: Place, directory: Place) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) if the owner of `dataflow` may not want this.
+
+    The programs come from `directory`. Nobody must get own programs run as another user by placing
+    that user's dataflow file beside them.
+    """
+    reason = dataflow.borrowed or directory.borrowed
+    if directory.uid not in (0, dataflow.uid):
+        reason = reason or f"{user_name(directory.uid)} owns {shown(directory.path)}"
+    if directory.is_open:
+        reason = reason or f"everybody can write in {shown(directory.path)}"
+    if reason:
+        raise DoraSystemdError(
+            f"cannot choose a user by the owner of {shown(dataflow.path)}: {reason}",
+            "choose one with --uid USER",
+            ExitCode.BAD_INPUT,
+        )
+
+
+def _entry(wanted: str) -> pwd.struct_passwd:
+    refusal = DoraSystemdError(
+        f"cannot find a user {quoted(wanted)}", "see getent passwd", ExitCode.USAGE
+    )
+    is_number = wanted.isascii() and wanted.isdigit() and len(wanted) <= _MOST_DIGITS
+    return _known(int(wanted) if is_number else wanted, refusal)
+
+
+def _owner_entry(owner: int, dataflow: str) -> pwd.struct_passwd:
+    message = f"cannot choose a user: the owner of {dataflow} is {owner}, which has no name"
+    hint = "choose one with --uid USER"
+    return _known(owner, DoraSystemdError(message, hint, ExitCode.BAD_INPUT))
+
+
+def _default_entry() -> pwd.struct_passwd:
+    message = f"cannot choose a user: the dataflow is root's and there is no user {DEFAULT_USER}"
+    hint = f"choose one with --uid USER, or make it: useradd --system {DEFAULT_USER}"
+    return _known(DEFAULT_USER, DoraSystemdError(message, hint, ExitCode.BAD_INPUT))
+
+
+def _known(user: int | str, refusal: DoraSystemdError) -> pwd.struct_passwd:
+    """The entry of a uid or a name. Raises `refusal` if there is none."""
+    try:
+        return pwd.getpwuid(user) if isinstance(user, int) else pwd.getpwnam(user)
+    except (KeyError, OverflowError) as error:
+        raise refusal from error
