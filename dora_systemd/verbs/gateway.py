@@ -79,5 +79,5 @@ def read_variables(manager: Manager, scope: Scope, selector: str | None) -> dict
     if selector is None:
         port = require_gateway(manager, scope)
         return coordinator_variables(port, read_token(scope, port))
-    cell = Selector(selector).find(manager)
+    cell = Selector(selector).find_present(manager, scope)
     return dora_environment(reached_coordinator(scope, manager, cell))

@@ -11,7 +11,7 @@ from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.decisions.views.top import Look, TopEntry
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import proven, read_cells
+from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.list import row_of
 from dora_systemd.verbs.facts.reading import Reading, read_dataflow, slice_group
 from dora_systemd.verbs.facts.selector import Selector
@@ -33,10 +33,14 @@ class Top:
         self._scope = scope
         self._before: dict[str, _Seen] = {}
         cells = read_cells(manager) if selectors else []
-        chosen = [Selector(selector).loaded(cells) for selector in selectors]
-        for cell in chosen:
-            require_running(cell)
-        self._units = frozenset(cell.unit for cell in chosen)
+        self._units = frozenset(self._unit(Selector(one), cells) for one in selectors)
+
+    def _unit(self, selector: Selector, cells: Sequence[Cell]) -> str:
+        """The unit of the dataflow that is meant, which has to run. Raises DoraSystemdError."""
+        with selector.telling_ended(self._scope):
+            cell = selector.loaded(cells)
+        require_running(cell)
+        return cell.unit
 
     def look(self) -> Look:
         """A snapshot of what is running; rates are since the last snapshot."""

@@ -5,8 +5,8 @@ the same words and give the same errors. `list` without a name does not load thi
 """
 
 import re
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, TypeVar
@@ -115,16 +115,23 @@ class Selector:
         files = filter(None, (read_cell(manager, unit_name(one)) for one in names))
         return next(files, None) or self.loaded(cells)
 
-    def find_present(self, manager: Manager, scope: Scope) -> Cell:
-        """As find(); NOT_RUNNING for one that has ended, which only the journal knows."""
+    @contextmanager
+    def telling_ended(self, scope: Scope) -> Iterator[None]:
+        """Turn NOT_FOUND into NOT_RUNNING for one that has ended, which only the journal knows."""
         try:
-            return self.find(manager)
+            yield
         except DoraSystemdError as error:
             row = self._recorded(scope) if error.code is ExitCode.NOT_FOUND else None
             if row is None:
                 raise
-        message = f"cannot use the dataflow {row.name}: it has ended"
-        raise DoraSystemdError(message, f"doractl start {row.name}", ExitCode.NOT_RUNNING)
+            message = f"cannot use the dataflow {row.name}: it has ended"
+            hint = f"doractl start {row.name}"
+            raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING) from error
+
+    def find_present(self, manager: Manager, scope: Scope) -> Cell:
+        """As find() and telling_ended()."""
+        with self.telling_ended(scope):
+            return self.find(manager)
 
     def find_enabled(self, manager: Manager, scope: Scope) -> Cell:
         """As find(), also an enabled one that systemd has lost, see lost_units()."""
@@ -165,12 +172,15 @@ def is_pattern(text: str) -> bool:
 
 
 def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]:
-    """The dataflows that `texts` mean, each once; as selectors_of() and find_enabled()."""
-    cells = read_cells(manager)
-    found = (
-        one.proven(cells) or one.find_enabled(manager, scope) for one in selectors_of(texts, cells)
-    )
-    return list(dict.fromkeys(found))
+    """The dataflows that `texts` mean, each once; as selectors_of() and find_enabled().
+
+    Raises DoraSystemdError (NOT_RUNNING) for one that has ended.
+    """
+    cells, found = read_cells(manager), dict[Cell, None]()
+    for one in selectors_of(texts, cells):
+        with one.telling_ended(scope):
+            found[one.proven(cells) or one.find_enabled(manager, scope)] = None
+    return list(found)
 
 
 def _expanded(text: str, known: Sequence[Named]) -> list[Selector]:

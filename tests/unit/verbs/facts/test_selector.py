@@ -1,5 +1,7 @@
 """Which dataflow a text means, wherever it is looked for."""
 
+from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -9,9 +11,12 @@ from hypothesis import strategies as st
 from dora_systemd.adapters.bus.manager import UnitState
 from dora_systemd.adapters.journal.reader import LastEvent
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_row
 from dora_systemd.verbs.facts.selector import Selector, find_all
+from dora_systemd.verbs.gateway import read_variables
+from dora_systemd.verbs.top import Top
 from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
@@ -136,17 +141,26 @@ def test_the_newest_one_that_has_ended(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert Selector("nobody").ended(scope) is None
 
 
+NEEDS_IT: dict[str, Callable[[str, FakeManager, Scope], object]] = {
+    "set": lambda text, manager, scope: Selector(text).find_present(manager, scope),
+    "enable": lambda text, manager, scope: find_all(manager, scope, ["other", text]),
+    "top": lambda text, manager, scope: Top(manager, scope, [text]),
+    "env": lambda text, manager, scope: read_variables(manager, scope, text),
+}
+"""What asks for a dataflow that systemd has, as one of the verbs that do so in the same way."""
+
+
 def test_what_has_ended_is_known_and_not_there(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """`set` and `inhibit` have nothing to change; "no dataflow named" is for what nobody knows."""
+    """A verb that needs it has nothing to do; "no dataflow named" is for what nobody knows."""
     scope, manager = ScopeIn(is_user=True, uid=1000, root=tmp_path), FakeManager()
     manager.add(options("other", THIRD))
     journal = FakeJournal(monkeypatch, tmp_path)
     journal.write(life_record("dataflow-stopped", 1, "robot", UUID, scope=scope))
-    for text in ("robot", UUID[:8]):
+    for text, need in product(("robot", UUID[:8]), NEEDS_IT.values()):
         with pytest.raises(DoraSystemdError, match="use the dataflow robot: it has end") as caught:
-            Selector(text).find_present(manager, scope)
+            need(text, manager, scope)
         assert (caught.value.code, caught.value.hint) == (
             ExitCode.NOT_RUNNING,
             "doractl start robot",
