@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked, unusable
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.releases.entries import FILE, LINK, Found, Stored, of_project, touched
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import surplus
@@ -39,9 +40,9 @@ from dora_systemd.verbs.releases.source import (
 from dora_systemd.verbs.releases.trial import (
     Standing,
     read_after_wait,
+    read_deployable,
     read_past,
     read_standing,
-    require_deployable,
 )
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
@@ -106,10 +107,26 @@ def compare(
 
 def present(manager: Manager, scope: Scope, store: Store) -> Manifest | None:
     """The manifest of the release that every start runs, or of the newest one."""
-    current = read_standing(manager, scope, unit_name(store.name)).current
+    return _manifest_of(store, read_standing(manager, scope, unit_name(store.name)))
+
+
+def _manifest_of(store: Store, standing: Standing) -> Manifest | None:
     with suppress(DoraSystemdError):  # it is not readable, or "" is no release
-        return store.manifest(current)
+        return store.manifest(standing.current)
     return newest(store)
+
+
+@dataclass(frozen=True)
+class _Deploy:
+    """A deploy under way. The fields are those of deploy()."""
+
+    manager: Manager
+    scope: Scope
+    request: DeployRequest
+    tell: Tell
+    warn: Callable[[str], None]
+    source: Source
+    store: Store
 
 
 def deploy(
@@ -126,13 +143,13 @@ def deploy(
     everything is as before.
     """
     source = source or find_source(scope, request.start, bool(request.build_timeout))
-    name = source.plan.options.name
-    store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
-    require_deployable(manager, scope, standing)
+    store = store_of(scope, source.plan.options.name)
+    work, unit = _Deploy(manager, scope, request, tell, warn, source, store), unit_name(store.name)
+    read_deployable(manager, scope, unit)  # refused before there is a directory for its releases
     with locked(store):
-        standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
+        standing = read_deployable(manager, scope, unit)  # from here on no other deploy changes it
         require_same_user("deploy", source.plan, _user_of(manager, standing, newest(store)))
-        if same := _find_same(manager, scope, source, store, standing, request):
+        if same := _find_same(work, standing):
             prune(manager, scope, store, request.keep, same.id)
             return _deployed(standing, same, 0, is_unchanged=True)
         require_uninhibited(
@@ -140,26 +157,14 @@ def deploy(
         )
         standing = read_after_wait(manager, scope, standing, "deploy")
         clean(manager, store, standing)
-        former = present(manager, scope, store)
+        former = _manifest_of(store, standing)
         copy = copy_project(manager, scope, source, store, standing, request.build_timeout, tell)
         release = copy.manifest.id
-        try:
-            text = _unit_text(manager, scope, source, store, request, copy.manifest, tell, warn)
-            store.write_unit(release, text)
-        except BaseException as error:
-            store.remove(release)
-            if isinstance(error, DoraSystemdError):
-                raise _at_source(error, store, release, source) from error
-            if isinstance(error, OSError):
-                raise unusable(store.path, error) from error
-            raise
-        options = runner_of(text)
-        assert options is not None
+        text, options = _checked(work, copy.manifest)
         lost = _lost_note(former, request.start, source)
         for note in (*copy.notes, *source_notes(source, store.tree(release)), *lost):
             warn(note)
-        standing = read_standing(manager, scope, standing.boot.unit)  # the copy took its time
-        require_deployable(manager, scope, standing)
+        standing = read_deployable(manager, scope, unit)  # the copy took its time
         how, want_boot = request.how, request.want_boot
         change = Change(release, text, options, request.soak, want_boot, "deploy", how, _COMMAND)
         try:
@@ -167,7 +172,7 @@ def deploy(
             change_release(manager, scope, store, standing, change, tell, gate)
         except BaseException as error:
             if getattr(error, "code", None) is not ExitCode.ROLLED_BACK:
-                _remove_unused(manager, scope, store, release)
+                _remove_unused(work, release)
             raise
         finally:
             prune(manager, scope, store, request.keep, release)
@@ -181,21 +186,6 @@ def _user_of(manager: Manager, standing: Standing, last: Manifest | None) -> str
     if standing.running:
         return str(manager.read(standing.boot.unit, ["User"])["User"])
     return last.user if last else ""
-
-
-def _find_same(
-    manager: Manager,
-    scope: Scope,
-    source: Source,
-    store: Store,
-    standing: Standing,
-    request: DeployRequest,
-) -> Manifest | None:
-    """Find the release that runs, if the deploy would change nothing and is not forced."""
-    is_to_enable = request.want_boot and not standing.boot.is_enabled
-    if is_to_enable or request.how is IfInhibited.FORCE:
-        return None
-    return find_unchanged(manager, scope, source, store, standing, request.start)
 
 
 def _deployed(
@@ -213,44 +203,52 @@ def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) 
     What cannot be removed now can be after the next deploy.
     """
     with suppress(DoraSystemdError, OSError):
-        standing = read_standing(manager, scope, unit_name(store.name))
+        standing = read_standing(manager, scope, unit_name(store.name))  # after the trial
         used = {latest, standing.trial}
         past = read_past(store, standing.current)
         for release in surplus(store.known(), keep, standing.current, used, past):
             store.remove(release)
 
 
-def _remove_unused(manager: Manager, scope: Scope, store: Store, release: str) -> None:
+def _remove_unused(work: _Deploy, release: str) -> None:
     """Remove a release that has never been tried, unless it can still be what runs."""
     with suppress(DoraSystemdError):
-        standing = read_standing(manager, scope, unit_name(store.name))
+        standing = read_standing(work.manager, work.scope, unit_name(work.store.name))
         if release not in (standing.current, standing.trial):
-            store.remove(release)
+            work.store.remove(release)
 
 
-def _unit_text(
-    manager: Manager,
-    scope: Scope,
-    source: Source,
-    store: Store,
-    request: DeployRequest,
-    manifest: Manifest,
-    tell: Tell,
-    warn: Callable[[str], None],
-) -> str:
-    """The unit file of the copy, which has been checked as for a start."""
-    tell(checking())
+def _checked(work: _Deploy, manifest: Manifest) -> tuple[str, RunnerOptions]:
+    """The unit file of the copy, checked as for a start; the copy is removed if that fails."""
+    store, release = work.store, manifest.id
+    try:
+        text = _unit_text(work, manifest)
+        store.write_unit(release, text)
+    except BaseException as error:
+        store.remove(release)
+        if isinstance(error, DoraSystemdError):
+            raise _at_source(error, store, release, work.source) from error
+        if isinstance(error, OSError):
+            raise unusable(store.path, error) from error
+        raise
+    options = runner_of(text)
+    assert options is not None
+    return text, options
+
+
+def _unit_text(work: _Deploy, manifest: Manifest) -> str:
+    manager, store, start = work.manager, work.store, work.request.start
+    work.tell(checking())
     tree = store.tree(manifest.id)
-    require_same(source, tree)
-    wanted = released(source, request.start, tree, manifest.uuid)
-    plan = make_plan(scope, wanted)
+    require_same(work.source, tree)
+    plan = make_plan(work.scope, released(work.source, start, tree, manifest.uuid))
     versions = {**manifest.versions, **check_plan(lambda: manager, plan)}
     versions |= {"systemd": manager.version()}
-    store.write_manifest(replace(manifest, versions=versions, given=_given(request.start)))
+    store.write_manifest(replace(manifest, versions=versions, given=_given(start)))
     properties, warnings = plan_properties(plan, manager)
     for warning in warnings:
-        warn(warning)
-    return unit_text(manager, scope, plan, format_unit(properties))
+        work.warn(warning)
+    return unit_text(manager, work.scope, plan, format_unit(properties))
 
 
 def _given(request: StartRequest) -> dict[str, str | list[str]]:
@@ -277,19 +275,16 @@ def _at_source(
     return DoraSystemdError(message, hint, error.code)
 
 
-def find_unchanged(
-    manager: Manager,
-    scope: Scope,
-    source: Source,
-    store: Store,
-    standing: Standing,
-    request: StartRequest,
-) -> Manifest | None:
-    """Find the release that runs, if it has the files and the settings of `source`.
+def _find_same(work: _Deploy, standing: Standing) -> Manifest | None:
+    """Find the release that runs, if it has the files and the settings of the project.
 
-    request: of the deploy. None also if that cannot be told: then the deploy reports why.
+    None also if the deploy is to enable it or is forced, and if the deploy reports what prevents
+    an answer.
     """
-    release = standing.current
+    release, store, source = standing.current, work.store, work.source
+    is_to_enable = work.request.want_boot and not standing.boot.is_enabled
+    if is_to_enable or work.request.how is IfInhibited.FORCE:
+        return None
     if source.is_moving or not _runs(standing, release) or not store.is_proved(release):
         return None
     try:
@@ -297,8 +292,9 @@ def find_unchanged(
         if not _has_files_of(source, manifest):
             return None
         require_same(source, tree)
-        plan = make_plan(scope, released(source, request, tree, manifest.uuid))
-        text = unit_text(manager, scope, plan, format_unit(plan_properties(plan, manager)[0]))
+        plan = make_plan(work.scope, released(source, work.request.start, tree, manifest.uuid))
+        unit = format_unit(plan_properties(plan, work.manager)[0])
+        text = unit_text(work.manager, work.scope, plan, unit)
         has_unit = standing.boot.text in (text, with_boot_check(text))
         return manifest if has_unit and store.intact(manifest) == manifest.files else None
     except (DoraSystemdError, OSError):

@@ -42,7 +42,7 @@ from dora_systemd.verbs.releases.deploy import (
 from dora_systemd.verbs.releases.listing import root_of, store_of
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source, find_source
-from dora_systemd.verbs.releases.trial import read_standing, require_deployable
+from dora_systemd.verbs.releases.trial import read_deployable
 from dora_systemd.verbs.start.read import read_files
 from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.start.settings import settings_of
@@ -88,8 +88,7 @@ def receive(
     """
     parcel = parse_parcel(stream.line(MOST_HEAD))
     store = store_of(scope, parcel.name)
-    standing = read_standing(manager, scope, unit_name(parcel.name))
-    require_deployable(manager, scope, standing)
+    standing = read_deployable(manager, scope, unit_name(parcel.name))
     if request.how is IfInhibited.REFUSE:  # a wait must see the end of `stream`: deploy() waits
         require_uninhibited(
             scope, standing.running, "deploy", request.how, lambda text: tell(waiting(text))

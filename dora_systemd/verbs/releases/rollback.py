@@ -29,9 +29,8 @@ from dora_systemd.verbs.releases.trial import (
     go_back,
     note_fault,
     read_after_wait,
+    read_deployable,
     read_past,
-    read_standing,
-    require_deployable,
 )
 
 _COMMAND = "doractl rollback"
@@ -58,8 +57,7 @@ def roll_back(
     """
     store = store_of(scope, deployed_name(manager, scope, selector))
     with locked(store, make=False):
-        standing = read_standing(manager, scope, unit_name(store.name))
-        require_deployable(manager, scope, standing)
+        standing = read_deployable(manager, scope, unit_name(store.name))
         clean(manager, store, standing)
         if release is None and standing.trial and not standing.current:
             require_uninhibited(

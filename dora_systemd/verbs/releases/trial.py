@@ -121,6 +121,13 @@ def require_deployable(manager: Manager, scope: Scope, standing: Standing) -> No
         )
 
 
+def read_deployable(manager: Manager, scope: Scope, unit: str) -> Standing:
+    """As read_standing(), and require_deployable()."""
+    standing = read_standing(manager, scope, unit)
+    require_deployable(manager, scope, standing)
+    return standing
+
+
 def read_after_wait(manager: Manager, scope: Scope, before: Standing, verb: str) -> Standing:
     """What there is after a wait for locks of what ran `before`.
 
@@ -135,9 +142,7 @@ def read_after_wait(manager: Manager, scope: Scope, before: Standing, verb: str)
             hint = f"run doractl {verb} again if it is to run"
             message = f"cannot {verb} {cell.name}: {reason}"
             raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING)
-    standing = read_standing(manager, scope, before.boot.unit)
-    require_deployable(manager, scope, standing)
-    return standing
+    return read_deployable(manager, scope, before.boot.unit)
 
 
 def begin_trial(manager: Manager, standing: Standing, text: str) -> None:
