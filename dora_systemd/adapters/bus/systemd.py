@@ -16,8 +16,14 @@ import select
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from dora_systemd.adapters.bus.connection import MANAGER_OBJECT, SERVICE, connect, decoded, encoded
-from dora_systemd.adapters.bus.errors import explained
+from dora_systemd.adapters.bus.connection import (
+    MANAGER_OBJECT,
+    SERVICE,
+    connect,
+    decoded,
+    encoded,
+    explained,
+)
 from dora_systemd.adapters.bus.manager import JOB_DONE, Beside, Observer, Property, UnitState
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope

@@ -7,7 +7,6 @@ replaces them: dora's coordinator and its daemon would each do it once more (see
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.json_size import is_infinite
@@ -69,15 +68,6 @@ def unset_variables(dataflow: Dataflow, environment: Mapping[str, str]) -> list[
     """Return the variables that values of `env:` name, and that nothing gives a value."""
     names = (name for text in _texts(dataflow) for name in _names(text, with_default=False))
     return [name for name in dict.fromkeys(names) if name not in environment]
-
-
-def sent_again(node: Mapping[str, Any]) -> dict[str, Any]:
-    """A node as the coordinator has it, for a request: it replaces variables in it once more."""
-    env = node.get("env")
-    if not isinstance(env, Mapping):
-        return dict(node)
-    texts = {key: one.replace("$", "$$") for key, one in env.items() if isinstance(one, str)}
-    return {**node, "env": {**env, **texts}}
 
 
 def _until_daemon(text: str) -> str:

@@ -4,13 +4,15 @@ Nobody else restarts a node for this: dora does, by its RestartNode, within the 
 """
 
 import asyncio
+import mmap
+import os
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.dora.probe import probe_python
-from dora_systemd.adapters.host.shared_times import SharedTimes
 from dora_systemd.decisions.cell.owes import RESTART, WARN
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import protocol
@@ -142,3 +144,28 @@ class Watch:
             return (await self._engine.ask_apart(params, _ANSWER_SECONDS)).error
         except DoraSystemdError as error:
             return error.message
+
+
+class SharedTimes:
+    """`size` bytes in the file at `path`, all 0 at first, which two processes share by mmap(2).
+
+    Raises OSError.
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        path.unlink(missing_ok=True)
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        descriptor = os.open(path, flags, 0o600)
+        try:
+            os.posix_fallocate(descriptor, 0, size)  # else a full file system would be SIGBUS
+            self._map = mmap.mmap(descriptor, size)
+        finally:
+            os.close(descriptor)
+
+    def read(self) -> bytes:
+        """What is in the file now."""
+        return self._map[:]
+
+    def close(self) -> None:
+        """Forget it; the file stays for those who read it by its path."""
+        self._map.close()

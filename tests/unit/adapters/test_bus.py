@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.adapters.bus import connection
-from dora_systemd.adapters.bus import errors as bus_errors
+from dora_systemd.adapters.bus import connection as bus_errors
 from dora_systemd.adapters.bus import systemd as bus
 from dora_systemd.adapters.bus.connection import decoded, encoded
 from dora_systemd.adapters.bus.manager import Observer

@@ -62,7 +62,7 @@ _TABLE = {
         link.relay verbs.facts.lives verbs.start.sandbox
     """,
     ROOTS: """
-        adapters.bus.connection adapters.bus.errors adapters.host.unit_files
+        adapters.bus.connection adapters.host.unit_files
         adapters.host.guard
         adapters.releases.draft adapters.releases.transfer
         adapters.releases.store verbs.releases.source verbs.releases.trial
@@ -76,7 +76,7 @@ _TABLE = {
     """,
     CELL: """
         adapters.dora.check adapters.dora.engine adapters.dora.websocket adapters.host.fd_store
-        adapters.host.notify_socket adapters.host.shared_times
+        adapters.host.notify_socket runner.owes.watch
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
         adapters.runner_socket.door
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin

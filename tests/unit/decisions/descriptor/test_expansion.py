@@ -6,7 +6,6 @@ from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.descriptor.expansion import (
     called_variables,
     expanded,
-    sent_again,
     unset_variables,
 )
 
@@ -60,10 +59,3 @@ def test_braces_that_nobody_closes() -> None:
     dataflow = parse_dataflow({"nodes": [{"id": "a", "path": "a", "env": {"X": text}}]}, "f")
     assert called_variables(dataflow, {"A": "a", "B": "b"}) == {}
     assert expanded({"X": f"${{A}}{text}$A"}, {"A": "a"}) == {"X": f"a{text}a"}
-
-
-def test_what_the_coordinator_gets_again() -> None:
-    env = {"A": "$$", "B": "${DORA_SYSTEMD_NUMBER:-inf}", "N": 5}
-    again = sent_again({"id": "one", "env": env})
-    assert again["env"] == {"A": "$$$$", "B": "$${DORA_SYSTEMD_NUMBER:-inf}", "N": 5}
-    assert sent_again({"id": "one", "env": None}) == {"id": "one", "env": None}
