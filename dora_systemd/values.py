@@ -8,6 +8,7 @@ message, and keep the hint.
 import re
 import time
 from collections.abc import Iterable
+from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -229,3 +230,13 @@ def cpus_file(value: int) -> str:
         else:
             ranges.append([cpu])
     return ",".join("-".join(map(str, one)) for one in ranges) or "\n"
+
+
+def as_mapping(value: object) -> dict[str, Any]:
+    """The value if it is a mapping of JSON or YAML, else an empty one."""
+    return value if isinstance(value, dict) else {}
+
+
+def as_list(value: object) -> list[Any]:
+    """The value if it is a list of JSON or YAML, else an empty one."""
+    return value if isinstance(value, list) else []

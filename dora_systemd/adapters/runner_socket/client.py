@@ -21,6 +21,7 @@ from typing import Any
 from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator, parse_token
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.sockets import connect_unix, plain
+from dora_systemd.values import as_mapping
 
 Request = Mapping[str, Any]
 MAX_BYTES = 1 << 16
@@ -90,12 +91,6 @@ def relay(path: Path) -> tuple[socket.socket, str]:
         return stream, token
 
 
-def require_access(path: Path) -> None:
-    """Return if the caller may use the runner at `path`. Raises DoraSystemdError."""
-    with _reaching(path):
-        connect_unix(path, RELAY_SECONDS).close()
-
-
 def done_of(path: Path, reply: Request) -> list[str]:
     """What the runner at `path` reports to have done, for people. Raises DoraSystemdError."""
     done = reply.get("done")
@@ -110,7 +105,7 @@ def parse_line(line: bytes) -> dict[str, Any] | None:
         request = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return request if isinstance(request, dict) else {}
+    return as_mapping(request)
 
 
 def _exchange(

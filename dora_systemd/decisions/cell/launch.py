@@ -22,7 +22,7 @@ from dora_systemd.decisions.descriptor.expansion import expanded
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind, split_arguments
 from dora_systemd.decisions.watchdog.watchdogs import watchdog_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import INFINITY, SECOND, quoted, shown
+from dora_systemd.values import INFINITY, SECOND, as_mapping, quoted, shown
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
 _BUILT = ("build", "git", "branch", "tag", "rev")
@@ -60,8 +60,7 @@ def launch_descriptor(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, Any]:
         kept = {key: dataflow.env[key] for key in dataflow.env if key not in plan.options.env_keys}
         document["env"] = expanded(kept, plan.environment)
     if plan.options.debug:
-        given = document.get("debug")
-        debug = given if isinstance(given, Mapping) else {}
+        debug = as_mapping(document.get("debug"))
         document["debug"] = {**debug, "enable_debug_inspection": True}
     if plan.options.exit_when_nodes_finish is not None:
         document["exit_when_nodes_finish"] = plan.options.exit_when_nodes_finish

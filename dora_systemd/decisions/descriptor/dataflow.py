@@ -20,7 +20,7 @@ from dora_systemd.decisions.descriptor.nodes import (
     mapping_of,
     parse_node,
 )
-from dora_systemd.values import quoted
+from dora_systemd.values import as_mapping, quoted
 
 MAX_JSON = 1024 * 1024 - 4096
 """Maximum bytes of a descriptor as JSON: dora refuses control frames above 1 MiB in total."""
@@ -77,9 +77,7 @@ def parse_dataflow(document: object, source: str) -> Dataflow:
 
 def _with_finite_env(part: Any) -> Any:
     """A dataflow or node, with `.inf` and `.nan` in `env:` as texts, as dora has them."""
-    env = part.get("env") if isinstance(part, dict) else None
-    if not isinstance(env, dict):
-        return part
+    env = as_mapping(as_mapping(part).get("env"))
     odd = {key: str(one) for key, one in env.items() if isinstance(one, float) and is_infinite(one)}
     return {**part, "env": {**env, **odd}} if odd else part
 
@@ -170,12 +168,10 @@ def session_path(dataflow: str) -> PurePath:
 
 def parse_session(document: object) -> BuildSession:
     """The session in a loaded YAML document; empty if dora did not write it."""
-    build = document.get("local_build") if isinstance(document, dict) else None
-    if not isinstance(build, dict):
-        return BuildSession()
+    build = as_mapping(as_mapping(document).get("local_build"))
     directories, envs = (build.get(key) for key in ("node_working_dirs", "python_env_dirs"))
     return BuildSession(_texts(directories), _texts(envs))
 
 
 def _texts(value: object) -> dict[str, str]:
-    return {str(key): str(text) for key, text in value.items()} if isinstance(value, dict) else {}
+    return {str(key): str(text) for key, text in as_mapping(value).items()}

@@ -7,7 +7,7 @@ from typing import Any
 
 from dora_systemd.names import did_you_mean
 from dora_systemd.terminal_text import short_line, without_sequences
-from dora_systemd.values import quoted, shown
+from dora_systemd.values import as_list, as_mapping, quoted, shown
 
 _NUMBERED = re.compile(r"\d+: +")
 _OS_ERROR = re.compile(r"\(os error \d+\)$")
@@ -90,10 +90,8 @@ def name_input(reason: str, document: Any) -> str:
 
 
 def _inputs(document: Any, place: int) -> Mapping[Any, Any]:
-    nodes = document.get("nodes") if isinstance(document, Mapping) else None
-    node = nodes[place] if isinstance(nodes, list) and place < len(nodes) else None
-    inputs = node.get("inputs") if isinstance(node, Mapping) else None
-    return inputs if isinstance(inputs, Mapping) else {}
+    nodes = as_list(as_mapping(document).get("nodes"))
+    return as_mapping(as_mapping(nodes[place]).get("inputs")) if place < len(nodes) else {}
 
 
 def _troubles(value: Any) -> Iterator[str]:

@@ -15,7 +15,7 @@ from uuid import uuid4
 
 from dora_systemd.decisions.cell.exits import Exit, ExitKind
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.values import INFINITY, SECOND, as_list, as_mapping
 
 Params = str | Mapping[str, Any]
 
@@ -169,7 +169,7 @@ def parse_heartbeat(reply: Reply) -> int:
     Of several machines this is the head. INFINITY if its daemon is not connected, 0 if the reply
     does not tell.
     """
-    if not isinstance(_mapping(reply.result).get("ConnectedDaemons"), list):
+    if not isinstance(as_mapping(reply.result).get("ConnectedDaemons"), list):
         return 0
     return min((age for machine, age in parse_heartbeats(reply) if not machine), default=INFINITY)
 
@@ -180,12 +180,12 @@ def parse_heartbeats(reply: Reply) -> list[tuple[str, int]]:
     "" is a machine without a name. A daemon of which the reply does not tell it has 0. A machine
     that is back can be there twice.
     """
-    daemons = _list(_mapping(reply.result).get("ConnectedDaemons"))
-    return [(_machine_of(one), _silence_of(one)) for one in map(_mapping, daemons)]
+    daemons = as_list(as_mapping(reply.result).get("ConnectedDaemons"))
+    return [(_machine_of(one), _silence_of(one)) for one in map(as_mapping, daemons)]
 
 
 def _machine_of(daemon: Mapping[str, Any]) -> str:
-    return str(_mapping(daemon.get("daemon_id")).get("machine_id") or "")
+    return str(as_mapping(daemon.get("daemon_id")).get("machine_id") or "")
 
 
 def _silence_of(daemon: Mapping[str, Any]) -> int:
@@ -198,15 +198,11 @@ LIST: Params = "List"
 
 def parse_running(reply: Reply, name: str) -> str:
     """dora's id of the run with that name in the reply to LIST, or ""."""
-    for one in _list(_mapping(reply.result).get("DataflowList")):
-        ident = _mapping(_mapping(one).get("id"))
-        if ident.get("name") == name and _mapping(one).get("status") == "Running":
+    for one in as_list(as_mapping(reply.result).get("DataflowList")):
+        ident = as_mapping(as_mapping(one).get("id"))
+        if ident.get("name") == name and as_mapping(one).get("status") == "Running":
             return str(ident.get("uuid") or "")
     return ""
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
 
 
 def parse_results(reply: Reply) -> dict[str, Exit] | None:
@@ -215,11 +211,11 @@ def parse_results(reply: Reply) -> dict[str, Exit] | None:
     An empty mapping means that dora does not know, and never success: a coordinator without its
     daemon replies like that.
     """
-    result = _mapping(reply.result)
+    result = as_mapping(reply.result)
     if "DataflowSpawned" in result:
         return None
-    nodes = _mapping(
-        _mapping(_mapping(result.get("DataflowStopped")).get("result")).get("node_results")
+    nodes = as_mapping(
+        as_mapping(as_mapping(result.get("DataflowStopped")).get("result")).get("node_results")
     )
     return {node: _failure(verdict) for node, verdict in sorted(nodes.items())}
 
@@ -232,20 +228,16 @@ def parse_spawn_failure(reply: Reply) -> str:
     return "" if _ENDED_ALREADY.match(reply.error) else first_line(reply.error)
 
 
-def _mapping(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
 def _failure(verdict: Any) -> Exit:
-    if "Err" not in _mapping(verdict):
+    if "Err" not in as_mapping(verdict):
         return Exit()
-    error = _mapping(verdict["Err"])
-    cause = _mapping(error.get("cause"))
+    error = as_mapping(verdict["Err"])
+    cause = as_mapping(error.get("cause"))
     if "FailedToSpawn" in cause:
         return Exit(words=f"failed to spawn: {first_line(str(cause['FailedToSpawn']))}")
-    ended = exit_value(*next(iter(_mapping(error.get("exit_status")).items()), ("", None)))
+    ended = exit_value(*next(iter(as_mapping(error.get("exit_status")).items()), ("", None)))
     if "Cascading" in cause:
-        return ended._replace(by=str(_mapping(cause["Cascading"]).get("caused_by_node")))
+        return ended._replace(by=str(as_mapping(cause["Cascading"]).get("caused_by_node")))
     if error.get("cause") == "GraceDuration":
         return ended._replace(words=f"{ended.words} after the grace duration")
     return ended

@@ -27,7 +27,7 @@ from dora_systemd.decisions.descriptor.json_size import is_infinite
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_uuid
 from dora_systemd.terminal_text import escaped
-from dora_systemd.values import SECOND, quoted, scalar_text
+from dora_systemd.values import SECOND, as_mapping, quoted, scalar_text
 
 NO_ID = "00000000-0000-0000-0000-000000000000"
 """The id of a reply to a frame without one."""
@@ -178,11 +178,11 @@ def sent_flags(request: Request, written: Mapping[str, Any]) -> dict[str, object
     `env`, `--debug` to `debug`, and `--exit-when-nodes-finish`. Raises DoraSystemdError (BAD_INPUT)
     for a variable whose value the dora command could not send.
     """
-    sent = _mapping(request.body.get("dataflow"))
+    sent = as_mapping(request.body.get("dataflow"))
     flags: dict[str, object] = {}
-    if changed := _changed_env(_mapping(sent.get("env")), _mapping(written.get("env"))):
+    if changed := _changed_env(as_mapping(sent.get("env")), as_mapping(written.get("env"))):
         flags["env"] = changed
-    if _mapping(sent.get("debug")).get("enable_debug_inspection"):
+    if as_mapping(sent.get("debug")).get("enable_debug_inspection"):
         flags["debug"] = True
     ends = sent.get("exit_when_nodes_finish")
     if ends is not None and ends != written.get("exit_when_nodes_finish"):
@@ -206,7 +206,3 @@ def _changed_env(sent: Mapping[str, Any], written: Mapping[str, Any]) -> tuple[s
             )
         new.pop(key)
     return tuple(f"{key}={value}" for key, value in new.items() if old.get(key) != value)
-
-
-def _mapping(value: object) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}

@@ -9,6 +9,7 @@ import re
 from dataclasses import dataclass
 
 from dora_systemd.decisions.logs.fields import Value, encode_entry, legal_name
+from dora_systemd.values import as_mapping
 
 LINE_LIMIT = 1 << 20
 # dora's mark at the end of a line that it has cut at 1 MiB.
@@ -141,8 +142,7 @@ def _record_fields(record: dict[str, object]) -> dict[str, Value] | None:
     level = str(record.get("level")).lower()
     if level not in PRIORITIES:
         return None
-    nested = record.get("fields")
-    own = dict(nested) if isinstance(nested, dict) else {}
+    own = dict(as_mapping(record.get("fields")))
     message = record.get("message")
     if message is None:
         message = own.pop("message", "")

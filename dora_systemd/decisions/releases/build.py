@@ -9,6 +9,7 @@ from pathlib import PurePath
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.terminal_text import short_line, without_sequences
+from dora_systemd.values import as_list, as_mapping
 
 LOCK = "uv.lock"
 _LONGEST = 300
@@ -76,10 +77,8 @@ def built_nodes(dataflow: Dataflow) -> list[str]:
 
 def _builds(node: Node) -> Iterator[object]:
     yield node.build
-    operators = node.raw.get("operators")
-    every = operators if isinstance(operators, list) else []
-    for operator in (node.raw.get("operator"), *every):
-        yield operator.get("build") if isinstance(operator, Mapping) else None
+    for operator in (node.raw.get("operator"), *as_list(node.raw.get("operators"))):
+        yield as_mapping(operator).get("build")
 
 
 def has_builds(value: object) -> bool:

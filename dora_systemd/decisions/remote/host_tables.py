@@ -10,7 +10,7 @@ from dora_systemd.decisions.views.releases import HEADER as RELEASES
 from dora_systemd.decisions.views.releases import WHY, format_cells
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.selection import sorted_rows
-from dora_systemd.values import format_rounded_size
+from dora_systemd.values import as_mapping, format_rounded_size
 
 _TEXTS = ("uuid", "name", "unit", "status", "text", "problem")
 _NUMBERS = {
@@ -73,8 +73,7 @@ def cells_of(value: Mapping[str, Any]) -> list[str] | None:
     if not all(one is None or _is_number(one) for one in known):
         return None
     created, size, files = known
-    named = value.get("versions")  # an older version there does not tell them
-    versions = named if isinstance(named, dict) else {}
+    versions = as_mapping(value.get("versions"))
     numbers = [
         local_time(int(created or 0)),
         UNKNOWN if size is None else format_rounded_size(int(size)),

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 from dora_systemd.decisions.remote.hosts import NO_PROGRAM, Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_release_id
+from dora_systemd.values import as_mapping
 
 DONE = {"deploy": "deployed", "rollback": "rolled back"}
 UNDONE = {"deploy": "rolled back", "rollback": "undone"}
@@ -46,8 +47,7 @@ def verdict_of(
     outcome: Mapping[str, Any],
 ) -> Verdict:
     """The verdict about a host. error: why it was not reached, or is lost. outcome: its object."""
-    details = outcome.get("details")
-    known = details if isinstance(details, dict) else {}
+    known = as_mapping(outcome.get("details"))
     texts = [known.get(key) for key in ("release", "former")]
     release, former = (one if isinstance(one, str) and is_release_id(one) else "" for one in texts)
     word = _word(verb, end, error)

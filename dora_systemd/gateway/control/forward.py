@@ -20,6 +20,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.session import Result, Talk, find_by_uuid
 from dora_systemd.gateway.control.state import ended_descriptor
 from dora_systemd.scope import Scope
+from dora_systemd.values import as_mapping
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
@@ -90,9 +91,9 @@ async def subscribe_topics(talk: Talk, request: Request) -> Result:
 
 def _subscription(reply: Reply) -> str:
     """The id of the new subscription. Raises DoraSystemdError with dora's message."""
-    made = reply.result.get("TopicSubscribed") if isinstance(reply.result, dict) else None
-    if isinstance(made, dict) and isinstance(made.get("subscription_id"), str):
-        return str(made["subscription_id"])
+    made = as_mapping(as_mapping(reply.result).get("TopicSubscribed")).get("subscription_id")
+    if isinstance(made, str):
+        return made
     raise DoraSystemdError(f"cannot subscribe: {reply.error or 'dora does not say why'}")
 
 

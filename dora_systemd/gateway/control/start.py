@@ -26,7 +26,7 @@ from dora_systemd.gateway.control.state import spawned
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import list_directory
-from dora_systemd.values import shown
+from dora_systemd.values import as_mapping, shown
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.start.start import claim
@@ -110,5 +110,5 @@ def _session(path: Path) -> object:
     kept = Path(session_path(str(path)))
     with suppress(DoraSystemdError):
         document = parse_yaml(decoded(read_file(kept).data, kept), kept)
-        return document.get("session_id") if isinstance(document, dict) else None
+        return as_mapping(document).get("session_id")
     return None

@@ -15,6 +15,7 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.files import read_file, unreadable
 from dora_systemd.trust.sight import Sight
+from dora_systemd.values import as_mapping
 
 _MOST_FILES = 50
 """Maximum number of module files; they can refer to each other in a circle."""
@@ -54,13 +55,12 @@ def _nodes_of(path: Path, sight: Sight) -> Iterator[dict[str, Any]]:
         return
     with suppress(DoraSystemdError):
         document = parse_yaml(decoded(data, path), path)
-        nodes = document.get("nodes") if isinstance(document, dict) else None
+        nodes = as_mapping(document).get("nodes")
         yield from (node for node in nodes or () if isinstance(node, dict))
 
 
 def _places(raw: Any) -> Iterator[Path]:
-    deploy = raw.get("deploy")
-    directory = deploy.get("working_dir") if isinstance(deploy, dict) else None
+    directory = as_mapping(raw.get("deploy")).get("working_dir")
     if isinstance(directory, str) and directory.startswith("/"):
         yield Path(directory)
     program = raw.get("path")

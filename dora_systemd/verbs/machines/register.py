@@ -20,7 +20,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
 from dora_systemd.trust.programs import own_account
-from dora_systemd.values import quoted, shown
+from dora_systemd.values import as_mapping, quoted, shown
 from dora_systemd.verbs.machines.probe import Probe, probe_as_caller, probe_as_link, run_there
 from dora_systemd.verbs.start.read import config_file, key_place
 from dora_systemd.verbs.start.settings import read_config
@@ -155,8 +155,7 @@ def _without(file: Path, name: str) -> str:
 def _checked(file: Path, before: str, text: str | None, name: str, added: str = "") -> str:
     """The new text, if YAML reads exactly this change from it. Raises DoraSystemdError."""
     wanted = dict(_document(file, before))
-    there = wanted.get("machines")
-    machines = dict(there) if isinstance(there, dict) else {}
+    machines = dict(as_mapping(wanted.get("machines")))
     if added:
         machines[name] = {"host": added}
     else:
@@ -171,8 +170,8 @@ def _checked(file: Path, before: str, text: str | None, name: str, added: str = 
 
 
 def _document(file: Path, text: str) -> dict[str, object]:
-    found = parse_yaml(text, file, allow_empty=True)
-    return {str(key): value for key, value in found.items()} if isinstance(found, dict) else {}
+    found = as_mapping(parse_yaml(text, file, allow_empty=True))
+    return {str(key): value for key, value in found.items()}
 
 
 def _text(file: Path) -> str:

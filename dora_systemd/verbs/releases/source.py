@@ -17,7 +17,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import Place, exists, is_directory
 from dora_systemd.trust.sight import Sight, sight_of
-from dora_systemd.values import shown
+from dora_systemd.values import as_list, shown
 from dora_systemd.verbs.start.plan import Plan, make_plan
 from dora_systemd.verbs.start.read import read_files
 from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest, path_of
@@ -220,7 +220,7 @@ def _programs(dataflow: Dataflow, working_directory: str) -> Iterator[str]:
     """The files that nodes and operators are started from, absolute, as far as they have a path."""
     for node in dataflow.nodes:
         raw = node.raw
-        operators = [raw.get("operator"), *_list(raw.get("operators"))]
+        operators = [raw.get("operator"), *as_list(raw.get("operators"))]
         values = [node.path, raw.get("module"), *(_operator_file(one) for one in operators)]
         for one in values:
             if isinstance(one, str) and one and "://" not in one:
@@ -231,10 +231,6 @@ def _programs(dataflow: Dataflow, working_directory: str) -> Iterator[str]:
 def _operator_file(raw: object) -> object:
     python = raw.get("python") if isinstance(raw, Mapping) else None
     return python.get("source") if isinstance(python, Mapping) else python
-
-
-def _list(value: object) -> list[object]:
-    return value if isinstance(value, list) else []
 
 
 def _is_below(path: str, directory: str) -> bool:

@@ -31,10 +31,6 @@ class SettingsFile:
         """Whether only root can have written and placed the file."""
         return not self.place.changeable
 
-    def words(self) -> Mapping[object, object]:
-        """Its keys."""
-        return self.document if isinstance(self.document, dict) else {}
-
 
 @dataclass(frozen=True)
 class Files:

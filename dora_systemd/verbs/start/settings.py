@@ -12,7 +12,7 @@ from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import hint_of_changeable
-from dora_systemd.values import shown
+from dora_systemd.values import as_mapping, shown
 from dora_systemd.verbs.start.read import (
     SYSTEM_FILE,
     Files,
@@ -35,7 +35,7 @@ def settings_of(scope: Scope, files: Files, request: StartRequest) -> Settings:
     for one in others:
         require_modest(one)
     settings = _resolved(found, flags, environment)
-    if not any(ENV_FILE.name in one.words() for one in others):
+    if not any(ENV_FILE.name in as_mapping(one.document) for one in others):
         return settings
     roots = _resolved([one for one in found if one not in others], flags, environment)
     named, by_root = settings[ENV_FILE], roots[ENV_FILE]
@@ -101,7 +101,7 @@ def _raising(settings: Settings) -> Iterator[tuple[str, str]]:
 def _check_trust(read: SettingsFile) -> None:
     """Refuse keys by which another user's file could make root read, run or grant something."""
     only = {setting.name: setting for setting in SETTINGS if setting.root_only}
-    dangerous = [only[key] for key in read.words() if key in only]
+    dangerous = [only[key] for key in as_mapping(read.document) if key in only]
     if dangerous:
         raise _untrusted(read, dangerous[0].name, dangerous[0].flags[0])
 
