@@ -98,19 +98,8 @@ def limit_lines(
     environment: that of the unit before the change. undo: gets what restores the limits.
     """
     path, before = socket_of(scope, cell), with_changes(cell.options, environment).log_rates
-    try:
-        ask(path, _rates_request({**before, **given}))
-    except DoraSystemdError as error:
-        if error.code is not ExitCode.USAGE:
-            raise
-        raise _is_older(cell) from error
+    ask(path, _rates_request({**before, **given}))
     undo.callback(ask, path, _rates_request(before))
-
-
-def _is_older(cell: Cell) -> DoraSystemdError:
-    """The error for a runner that does not know a request."""
-    message = f"cannot change {cell.name} while it runs: its runner is of an older version"
-    return DoraSystemdError(message, f"doractl restart {cell.name}, and once more")
 
 
 def _rates_request(rates: RateLimits) -> Mapping[str, Any]:

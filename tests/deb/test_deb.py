@@ -18,10 +18,6 @@ from tests.system.shells import SHELLS
 USERS = ("root", "alice")
 ALICE = "XDG_RUNTIME_DIR=/run/user/$(id -u)"
 MANUALS = (*sorted(path.name for path in (packages.CHECKOUT / "packaging/man").iterdir()), "dora.1")
-OLD_MODULES = {
-    "dora_systemd.runner.stop_post": "dora_systemd.runnerpost",
-    "dora_systemd.runner.reload.request": "dora_systemd.runnerask",
-}
 COMPLETIONS = (
     "/usr/share/bash-completion/completions/doractl",
     "/usr/share/zsh/vendor-completions/_doractl",
@@ -192,38 +188,6 @@ def test_upgrade_keeps_dataflows_running(tmp_path: Path) -> None:
         sh("doractl node restart robot detector", user)
         wait_for_plot(user, len(lines(user, "plot")))
         assert main_pid(user) in before[user][0]
-
-
-def test_an_enabled_unit_of_before_the_packages_goes_on() -> None:
-    """Unit files on machines name the modules as they were called in one folder."""
-    sh("doractl enable robot && doractl stop robot")
-    unit = Path(sh("systemctl show --value -p FragmentPath dora-robot").stdout.strip())
-    text = unit.read_text()
-    for new, old in OLD_MODULES.items():
-        assert new in text
-        text = text.replace(new, old)
-    unit.write_text(text)
-    sh("systemctl daemon-reload && systemctl start dora-robot")
-    seen = len(lines("root", "plot"))
-    wait_for_plot("root", seen)
-    assert "Nothing has changed" in reload_words()
-    sh("systemctl kill --kill-whom=main --signal=KILL dora-robot")
-    wait_for("its end is told", lambda: ends_told("runner-killed") == 1, 60)
-    sh("systemctl start dora-robot")
-    wait_for_plot("root", len(lines("root", "plot")))
-    sh("doractl disable robot")
-
-
-def reload_words() -> str:
-    """What ExecReload= prints."""
-    sh("systemctl reload dora-robot")
-    return sh("journalctl --sync && journalctl -u dora-robot -n 20 -o cat").stdout
-
-
-def ends_told(cause: str) -> int:
-    """The ends of the robot with this cause."""
-    sh("journalctl --sync")
-    return len(sh(f"journalctl -u dora-robot -o cat DORA_CAUSE={cause}").stdout.splitlines())
 
 
 def test_stop_and_start_after_that(flows: dict[str, Path]) -> None:

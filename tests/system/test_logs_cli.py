@@ -88,10 +88,6 @@ def test_letters_mean_what_they_mean_in_journalctl(talking: Cell) -> None:
     assert messages(talking, "--events", "-b") == messages(talking, "-b0", "--events") == everything
     assert "No entries" in "".join(logs(talking, talking.name, "--until", "1h", check=False))
     assert logs(talking, talking.name, "--until", "1h", "-q", check=False) == []
-    done = talking.doractl("logs", talking.name, "-o", "cat", "-n", "cam-left", "-g", "^line 3$")
-    assert done.stdout == "line 3\n"
-    assert done.stderr.startswith("doractl: -n is the number of lines now")
-    assert done.stderr.count("\n") == 1
 
 
 def test_found_lines_come_oldest_first(talking: Cell) -> None:

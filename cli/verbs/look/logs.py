@@ -35,9 +35,7 @@ Lines = TerminalLines | ShownLines | None
 
 _BOOT_OPTION = re.compile("-[afqr]*b|--boot")
 _COUNT = re.compile("[0-9]+")
-_OLD_NODE = re.compile(r"[A-Za-z0-9_.*?\[][A-Za-z0-9_.*?\[\]!-]*")
 _LEFT_OUT = "some messages have control characters; --all prints them, too"
-_OLD_N = "-n is the number of lines now, as in journalctl; for a node use --node {}"
 
 
 class LogsCommand(click.Command):
@@ -192,14 +190,12 @@ def command(
             return status
     options.pop("all_nodes")
     options["level"] = parse_level(options["level"]) if options["level"] else ""
-    tail, old_nodes = split_counts(counts)
-    if old_nodes and not options["is_quiet"]:
-        print_warnings([_OLD_N.format(old_nodes[0])])
+    tail = last_count(counts)
     check_readable(scope)
     journal = JournalReader()
     wanted = LogQuery(scope, tail=tail, levels=parse_filter(log_filter), **options)
     query = find_soon(
-        lambda: find_query(JournalReader(), wanted, selectors, (*nodes, *old_nodes), run),
+        lambda: find_query(JournalReader(), wanted, selectors, nodes, run),
         scope,
         selectors,
     )
@@ -217,22 +213,14 @@ def command(
     return ExitCode.OK
 
 
-def split_counts(values: Sequence[str]) -> tuple[str, list[str]]:
-    """The number of lines, "" for none, and the nodes: -n was --node, and 0.1 still takes both.
-
-    Raises DoraSystemdError (USAGE).
-    """
-    tail, nodes = "", []
+def last_count(values: Sequence[str]) -> str:
+    """The number of lines, "" for none. Raises DoraSystemdError (USAGE)."""
     for value in values:
-        if value == ALL_LINES or _COUNT.fullmatch(value):
-            tail = value
-        elif _OLD_NODE.fullmatch(value):
-            nodes.append(value)
-        else:
+        if value != ALL_LINES and not _COUNT.fullmatch(value):
             hint = "a number such as 100, or all"
             message = f"cannot use {quoted(value)} as a number of lines"
             raise DoraSystemdError(message, hint, ExitCode.USAGE)
-    return tail, nodes
+    return values[-1] if values else ""
 
 
 def _lines(journal: JournalReader, query: LogQuery) -> Lines:

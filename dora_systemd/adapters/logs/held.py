@@ -18,9 +18,8 @@ import struct
 from pathlib import Path
 
 SUFFIX = ".held"
-# The header: number of bytes, and number of the lines among them that journald has.
-_HEAD = struct.Struct("=QQ")
-_TO_THE_END = (1 << 64) - 1
+# The header: number of the lines that journald has.
+_HEAD = struct.Struct("=Q")
 _MOST_DONE = 1 << 20
 """Bytes that journald has taken, after which a new file begins even in the middle of a line."""
 
@@ -72,7 +71,7 @@ class HeldLines:
         if self._done + lines != self._noted and not self._is_broken:
             self._noted = self._done + lines
             with contextlib.suppress(OSError):
-                os.pwrite(self._fd, _HEAD.pack(_TO_THE_END, self._noted), 0)
+                os.pwrite(self._fd, _HEAD.pack(self._noted), 0)
 
     def sent_all(self, lines: int, rest: bytes | None) -> None:
         """Note that journald has the oldest batch, which has `lines` lines.
@@ -111,7 +110,7 @@ class HeldLines:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
         try:
             # Less is written where the disk is almost full.
-            if os.pwritev(fd, [_HEAD.pack(_TO_THE_END, 0), rest], 0) < _HEAD.size + len(rest):
+            if os.pwritev(fd, [_HEAD.pack(0), rest], 0) < _HEAD.size + len(rest):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             path.replace(self._path)
         except OSError:
@@ -136,8 +135,7 @@ def read_held(pipe: Path) -> tuple[bytes, int]:
     """The bytes kept when the runner was killed, and how many of their lines journald has."""
     try:
         content = held_path(pipe).read_bytes()
-        size, lines = _HEAD.unpack_from(content)
+        (lines,) = _HEAD.unpack_from(content)
     except (OSError, struct.error):
         return b"", 0
-    # Older versions write a real size, and may still be running after an upgrade.
-    return content[_HEAD.size : _HEAD.size + size], lines
+    return content[_HEAD.size :], lines

@@ -1,7 +1,6 @@
 """How a process ended: one value, and the one text for it.
 
-The text is in the journal (DORA_EXIT=) and in status.json. Runners of older versions have written
-it too, so it never changes.
+The text is in the journal (DORA_EXIT=) and in status.json.
 """
 
 import re

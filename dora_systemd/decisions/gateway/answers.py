@@ -145,10 +145,9 @@ def _program(node: Mapping[str, Any]) -> dict[str, str]:
     except ValueError:
         return {}
     command = words[5:] if words[3:5] == ["uv", "run"] else words[3:]
-    if not launcher.endswith(("/launcher.pl", "/launcher.sh")) or not command:
+    if not launcher.endswith("/launcher.pl") or not command:
         return {}
-    # Runners of older versions wrote /bin/sh.
-    if command[0] in ("sh", "/bin/sh") and command[1:2] == ["-c"]:
+    if command[0] == "sh" and command[1:2] == ["-c"]:
         return {"path": "shell", "args": " ".join(command[2:])}
     start = 1 + command.index("-u") if "-u" in command else 0
     # A program may have an argument "-u" as well as Python.

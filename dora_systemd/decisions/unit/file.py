@@ -7,7 +7,6 @@ wrote for a transient unit: both are equivalent for the same dataflow.
 import posixpath
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
 from dora_systemd.decisions.properties.assignments import (
@@ -19,7 +18,7 @@ from dora_systemd.decisions.properties.assignments import (
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.structs import MS_REC
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.names import release_of, unit_description, unit_name
+from dora_systemd.names import unit_name
 
 BOOT_TARGET = "dora.target"
 """Starts the enabled dataflows at boot, if it is installed; no other unit waits for it."""
@@ -147,26 +146,7 @@ def _properties(text: str) -> dict[str, Property] | None:
         except (KeyError, DoraSystemdError):
             return None
         properties = with_properties(properties, change)
-    if runner := runner_of(text):
-        properties = _as_written_today(properties, runner)
     return {slot: _ordered(one) for slot, one in properties.items()}
-
-
-def _as_written_today(
-    properties: dict[str, Property], runner: RunnerOptions
-) -> dict[str, Property]:
-    """The same without what only tells that an older version has written it."""
-    today: dict[str, tuple[Any, Any]] = {
-        "RestartSec": (runner.restart.delay, runner.restart.unit_delay),  # before HEAD_START
-        "Description": (
-            f"dora dataflow {runner.name}",
-            unit_description(runner.name, runner.uuid, release_of(runner.dataflow)),
-        ),
-    }
-    return {
-        slot: one._replace(value=today[slot][1]) if today.get(slot, ())[:1] == (one.value,) else one
-        for slot, one in properties.items()
-    }
 
 
 def _ordered(one: Property) -> Property:

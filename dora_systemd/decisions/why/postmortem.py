@@ -235,7 +235,7 @@ def _cause_of(life: Life, end: Happening) -> Cause:
     word = end.detail("cause")
     if word and word in list(Cause):
         return Cause(word)
-    lost = life.last(*_LOSSES)  # records of older versions do not have the cause
+    lost = life.last(*_LOSSES)
     if lost is not None:
         return Cause(lost.name)
     return Cause.NODE_FAILED if final_crashes(life) else Cause.UNIT_FAILED

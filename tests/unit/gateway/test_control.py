@@ -269,13 +269,13 @@ def test_descriptors() -> None:
         ("uv run python -u /x/a.py", "/x/a.py", ""),
         ("uv run /x/tool -n", "/x/tool", "-n"),
         ("/x/tool -u 5", "/x/tool", "-u 5"),
-        ("/bin/sh -c 'echo $X | cat'", "shell", "echo $X | cat"),
+        ("sh -c 'echo $X | cat'", "shell", "echo $X | cat"),
         ("sh -c 'exit 3'", "shell", "exit 3"),
     ],
 )
 def test_a_program_that_is_in_no_file(command: str, path: str, args: str) -> None:
     """A node of a module: what it runs is in what our launcher is told."""
-    launched = {"id": "m.a", "path": "/bin/sh", "args": f"/p/launcher.sh m.a /x pipe {command}"}
+    launched = {"id": "m.a", "path": "/bin/sh", "args": f"/p/launcher.pl m.a /x pipe {command}"}
     (node,) = restored_descriptor({"nodes": [launched]}, [], ("path", "args"))["nodes"]
     assert node == {"id": "m.a", "path": path, "args": args}
 

@@ -32,9 +32,6 @@ one layer do not import each other: verbs and runner meet in systemd."""
 
 DEPTHS = {house: depth for depth, layer in enumerate(LAYERS) for house in layer}
 
-OLD_NAMES = {"runnerask", "runnercheck", "runnerpost", "runnersettings"}
-"""Modules of the runner under the names that unit files on machines and running runners have."""
-
 ADAPTERS_MAY = {("adapters.dora", "adapters.host")}
 """An adapter imports no other one. But the dora command is a program, and a dataflow is a file."""
 
@@ -78,8 +75,6 @@ NOT_IN_RUNNERS = {
 
 def house_of(name: str) -> str:
     """The folder in dora_systemd/ that a module is in."""
-    if name in OLD_NAMES:
-        return "runner"
     return name.partition(".")[0] if "." in name else "words"
 
 
@@ -140,7 +135,7 @@ def test_no_module_imports_in_a_circle() -> None:
 
 def test_no_folder_imports_in_a_circle() -> None:
     graph: dict[str, set[str]] = defaultdict(set)
-    for name in PATHS.keys() - OLD_NAMES:
+    for name in PATHS:
         graph[folder_of(name)] |= {folder_of(target) for target in imports(name)[0]}
     for folder, targets in graph.items():
         targets.discard(folder)

@@ -161,13 +161,6 @@ def test_signals_are_as_they_were(environment: dict[str, str], tmp_path: Path) -
     assert launcher(environment, "kept", str(tmp_path), "keep", *words).stdout == here
 
 
-def test_the_old_name_goes_on(environment: dict[str, str], tmp_path: Path) -> None:
-    """Of a dataflow that runs while the package is upgraded."""
-    old = ("/bin/sh", str(PACKAGE / "launcher.sh"))
-    done = launch(environment, *old, "kept", str(tmp_path), "keep", "/bin/echo", "a b", "$x")
-    assert done.stdout == "a b $x\n"
-
-
 @pytest.mark.parametrize("key", ["ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY"])
 @pytest.mark.parametrize("text", ["/etc/own.json5", ""])
 def test_zenoh_of_ones_own(

@@ -223,7 +223,7 @@ def test_a_disk_that_is_full_and_has_room_again(rest: bytes, fifo: Path) -> None
 def test_a_disk_that_is_full_in_the_middle_of_a_write(fifo: Path) -> None:
     held = HeldLines(fifo)
     fd = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
-    with full_disk(20):
+    with full_disk(12):
         os.write(fd, b"long line")
         assert held.take(fd, 100) == b"long line"[:4]
         assert held.take(fd, 100) == b"long line"[4:]

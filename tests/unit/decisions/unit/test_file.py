@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.file import (
     persistent_unit,
@@ -42,22 +41,6 @@ def test_the_runner_is_found_again(dataflow: str, directory: str, value: str) ->
     assert runner_of(text) == runner
     assert says_the_same(text, persistent(runner, A=value, target="multi-user.target"))
     assert not says_the_same(text, persistent(runner, A=f"{value}x"))
-
-
-def test_a_unit_whose_runner_has_no_head_start_says_the_same() -> None:
-    text = persistent(options(restart=RestartPolicy("always")))
-    older = text.replace("RestartSec=100ms", "RestartSec=500ms")
-    assert older != text
-    assert says_the_same(text, older)
-    assert not says_the_same(text, text.replace("RestartSec=100ms", "RestartSec=2s"))
-
-
-def test_a_unit_without_the_uuid_in_its_description_says_the_same() -> None:
-    text = persistent(options())
-    older = text.replace(f"dora dataflow robot ({UUID})\n", "dora dataflow robot\n")
-    assert older != text
-    assert says_the_same(text, older)
-    assert not says_the_same(text, text.replace(f"robot ({UUID})\n", "my robot\n"))
 
 
 def test_sections_are_one_of_a_kind() -> None:

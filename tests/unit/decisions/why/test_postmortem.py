@@ -133,7 +133,7 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         (*RUNS, event("daemon-lost", exit="signal SIGKILL"), failed("daemon-lost", "gone")),
         *("Failed", Cause.DAEMON_LOST, "", "gone"),
     ),
-    "daemon, by an older version": (
+    "daemon, without its cause": (
         (*RUNS, event("daemon-lost"), event("dataflow-failed", reason="gone")),
         *("Failed", Cause.DAEMON_LOST, "", "gone"),
     ),
