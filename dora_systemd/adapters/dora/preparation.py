@@ -19,6 +19,7 @@ from dora_systemd.decisions.cell.limits import check_nodes
 from dora_systemd.decisions.cell.line_rates import check_rates
 from dora_systemd.decisions.cell.needs import check_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owes import check_owes
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
 from dora_systemd.decisions.cell.rights import check_rights_nodes
 from dora_systemd.decisions.descriptor.dataflow import (
@@ -29,7 +30,6 @@ from dora_systemd.decisions.descriptor.dataflow import (
     session_path,
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
-from dora_systemd.decisions.owes.check import check_owes
 from dora_systemd.decisions.watchdog.watchdogs import check_watchdogs
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
@@ -99,7 +99,7 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     check_restart_nodes(options.node_restarts, ids)
     launched = {node.id for node in dataflow.nodes if has_launcher(node)}
     check_rights_nodes(options.node_rights, ids, launched)
-    check_owes(options, dataflow.nodes)
+    check_owes(options.owes, dict(options.node_restarts), dataflow.nodes)
 
 
 def resolved(options: RunnerOptions) -> RunnerOptions:

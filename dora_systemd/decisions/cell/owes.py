@@ -1,14 +1,16 @@
 """What nodes owe: outputs on which a message has to come in time, and what happens if none does.
 
-They are part of the runner's command line, which `list` parses: imports only what loads quickly.
+They are part of the runner's command line, which `list` parses: it imports this module for a
+dataflow that has some.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.restarts import RestartPolicy
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import did_you_mean
+from dora_systemd.names import check_known, did_you_mean
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 PROBE = "dora-systemd-probe"
@@ -118,3 +120,55 @@ def base_of(policy: RestartPolicy, owes: Iterable[Owed], node: str) -> RestartPo
 def is_probe(node: str) -> bool:
     """Whether dora's node id is that of a probe."""
     return node.startswith(PROBE)
+
+
+_OTHER = "write then: warn or then: fail"
+_NEVER_RESTARTED = {
+    NodeKind.OPERATOR: "dora does not restart nodes made of operators",
+    NodeKind.DYNAMIC: "dora does not start it",
+}
+
+
+def check_owes(
+    owes: Sequence[Owed], restarts: Mapping[str, RestartPolicy], nodes: Sequence[Node]
+) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for an output that no node has, or no restart is possible.
+
+    restarts: policies of single nodes. nodes: with modules expanded.
+    """
+    if not owes:
+        return
+    by_id = {node.id: node for node in nodes}
+    check_known("cannot watch the outputs of", (one.node for one in owes), by_id)
+    for one in owes:
+        node = by_id[one.node]
+        _check_output(one, node)
+        if one.then == RESTART and (reason := _no_restart(node, restarts.get(node.id))):
+            hint = f"{_OTHER}, or another restart_policy"
+            hint = _OTHER if node.kind in _NEVER_RESTARTED else hint
+            raise _impossible(f"cannot restart the silent node {quoted(one.node)}: {reason}", hint)
+    for probe in filter(is_probe, by_id):
+        message = f"cannot watch outputs: the node {quoted(probe)} has a name that doractl needs"
+        raise _impossible(message, "give that node another id")
+
+
+def _check_output(owed: Owed, node: Node) -> None:
+    # ros2 nodes get outputs from their topics.
+    if node.kind is NodeKind.ROS2 or owed.output in node.outputs:
+        return
+    outputs = sorted(node.outputs)
+    message = f"cannot watch {quoted(owed.output)} of the node {quoted(node.id)}: no such output"
+    known = f"outputs: {', '.join(outputs)}" if outputs else "the node has no outputs"
+    raise _impossible(message, did_you_mean(owed.output, outputs) or known)
+
+
+def _no_restart(node: Node, own: RestartPolicy | None) -> str:
+    """Why dora would not restart the node, or ""."""
+    if node.kind in _NEVER_RESTARTED:
+        return _NEVER_RESTARTED[node.kind]
+    is_never = node.restart_policy == "never" if own is None else own.policy == "no"
+    return "it is never restarted, says its restart_policy" if is_never else ""
+
+
+def _impossible(message: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

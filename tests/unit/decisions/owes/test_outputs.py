@@ -8,10 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from dora_systemd.decisions.cell.launch import launch_descriptor
-from dora_systemd.decisions.cell.owes import SHORTEST, THEN, Owed, format_owed, is_probe, parse_owed
+from dora_systemd.decisions.cell.owes import (
+    SHORTEST,
+    THEN,
+    Owed,
+    check_owes,
+    format_owed,
+    is_probe,
+    parse_owed,
+)
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
-from dora_systemd.decisions.owes.check import check_owes
 from dora_systemd.decisions.owes.probe import (
     parse_times,
     probe_definition,
@@ -98,9 +105,9 @@ def flow(**keys: Any) -> Dataflow:
     return parse_dataflow({"nodes": [camera]}, "robot.yml")
 
 
-def check(owed: Owed, dataflow: Dataflow, **options: Any) -> str:
+def check(owed: Owed, dataflow: Dataflow, own: RestartPolicy | None = None) -> str:
     try:
-        check_owes(OPTIONS._replace(owes=(owed,), **options), dataflow.nodes)
+        check_owes((owed,), {"camera": own} if own else {}, dataflow.nodes)
     except DoraSystemdError as error:
         assert error.code == ExitCode.BAD_INPUT
         return f"{error.message}; {error.hint}"
@@ -119,10 +126,8 @@ def test_no_restart_is_promised_that_dora_does_not_give() -> None:
     never = flow(restart_policy="never")
     assert "cannot restart the silent node 'camera'" in check(CAMERA, never)
     assert check(CAMERA._replace(then="warn"), never) == ""
-    own = (("camera", RestartPolicy("no")),)
-    assert "its restart_policy; write then: warn" in check(CAMERA, flow(), node_restarts=own)
-    own = (("camera", RestartPolicy("always")),)
-    assert check(CAMERA, never, node_restarts=own) == ""
+    assert "its restart_policy; write then: warn" in check(CAMERA, flow(), RestartPolicy("no"))
+    assert check(CAMERA, never, RestartPolicy("always")) == ""
     dynamic = flow(path="dynamic")
     assert check(CAMERA, dynamic).endswith("dora does not start it; write then: warn or then: fail")
 
