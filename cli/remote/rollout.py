@@ -21,7 +21,6 @@ from dora_systemd.decisions.remote.rollout import (
     Columns,
     Verdict,
     may_go_on,
-    older,
     verdict_object,
     verdict_of,
     worst_status,
@@ -40,7 +39,6 @@ SILENCE_SECONDS = 600.0
 disk. ssh notices by itself when the network or sshd does. Each one tells every 30 s which step it
 is at, but not while it checks what it has, syncs 4 GiB to an SD card, or removes an old release."""
 _RECEIVE = "--from-stdin"
-_TOO_OLD = f"unknown option {_RECEIVE}".encode()
 _MOST = 1 << 20
 """Bytes of the answers of a host, and of what it complains of before the first."""
 
@@ -193,9 +191,7 @@ class Rollout:
         host, answer = ended.host, self._answer(ended.host)
         self._stage.wipe()
         error, outcome = ended.error, answer.outcome
-        if _TOO_OLD in answer.complaint:
-            error, answer.complaint = older(host), b""
-        elif not (error or ended.status or outcome):
+        if not (error or ended.status or outcome):
             error = invalid(host)
         self._complaints.said(host, answer.errors if self._is_quiet else answer.complaint)
         self._complaints.ended(host, error)

@@ -128,8 +128,9 @@ def _refusal(scope: Scope, cell: Cell) -> DoraSystemdError:
     if holders:
         message = f"cannot inhibit {cell.name}: it is locked by {format_holders(holders)}"
         return DoraSystemdError(message, "try again when that has ended", ExitCode.INHIBITED)
-    hint = "it may be starting; if an older version of doractl has started it, restart it"
-    return DoraSystemdError(f"cannot inhibit {cell.name}: it has no lock file", hint)
+    return DoraSystemdError(
+        f"cannot inhibit {cell.name}: it has no lock file", "it may be starting"
+    )
 
 
 def inhibited_dataflows(manager: Manager, scope: Scope) -> list[Inhibited]:

@@ -102,7 +102,7 @@ class CellStatus(NamedTuple):
     nodes: Mapping[str, NodeStatus] = {}
     samples: tuple[CpuSample, ...] = ()  # the last SAMPLES_KEPT CPU samples, oldest first
     lines: Mapping[str, LineCount] = {}  # by node; lost ones count for WHOLE_CELL
-    up_us: int = 0  # CLOCK_MONOTONIC µs of READY=1, 0 before it, and in tables of older versions
+    up_us: int = 0  # CLOCK_MONOTONIC µs of READY=1, 0 before it
     is_first: bool = False  # whether NRestarts= of the unit is certainly 0
     # of nodes with a notify socket, for parse_sign() of dora_systemd.decisions.watchdog.messages
     signs: Mapping[str, tuple[Any, ...]] = {}

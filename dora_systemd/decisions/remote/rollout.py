@@ -98,13 +98,6 @@ def worst_status(statuses: Sequence[int]) -> int:
     return max(statuses, default=ExitCode.OK)
 
 
-def older(host: Host) -> DoraSystemdError:
-    """The error of a host whose doractl does not know what it is asked for."""
-    hint = f"install this version there; doractl -H {host.text} version tells which one it has"
-    message = f"cannot deploy to {host.text}: the version there is too old to receive a project"
-    return DoraSystemdError(message, hint, ExitCode.USAGE)
-
-
 class Columns:
     """The table, a line at a time. width: of a terminal, None without one."""
 

@@ -149,7 +149,7 @@ def _listed(manager: Manager, state: UnitState) -> Cell | None:
 
 
 def _asked(manager: Manager, state: UnitState) -> Cell | None:
-    """The dataflow of a unit by its ExecStart=: a Description= can be an older version's."""
+    """The dataflow of a unit by its ExecStart=: its owner may have changed Description=."""
     options = _read_options(manager, state.unit)
     return Cell(state, options.uuid, manager, options) if options else None
 

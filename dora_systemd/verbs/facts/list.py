@@ -7,11 +7,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.limits import CPUS, has_cpus
 from dora_systemd.decisions.cell.machines import members_of
-from dora_systemd.decisions.cell.status import (
-    FAILED_BECAUSE,
-    GATHERING,
-    CellStatus,
-)
+from dora_systemd.decisions.cell.status import FAILED_BECAUSE, GATHERING, CellStatus
 from dora_systemd.decisions.resources.usage import (
     WHOLE_CELL,
     CpuSample,
@@ -100,8 +96,8 @@ def read_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
 def table_rows(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[DataflowRow]:
     """The rows of the table, by a number of questions that does not depend on theirs.
 
-    Except for dataflows that are down, on their way up or down, or have been restarted, and for
-    those of an older version: each of them has some questions of its own.
+    Except for dataflows that are down, on their way up or down, or have been restarted: each of
+    them has some questions of its own.
     """
     slice_path = slice_group(manager) if cells else None
     rows = [row_of(read_dataflow(manager, scope, cell, slice_path, is_row=True)) for cell in cells]

@@ -26,7 +26,6 @@ exec sh -c "$command"
 """
 DORACTL = """echo "$HOST $*" >>"$0.asked"
 case $HOST in
-    old) echo "doractl: unknown option --from-stdin" >&2; exit 2;;
     mad) echo '{"wants": [7]}'; cat >/dev/null;;
 esac
 case " $* " in *" rollback "*) ;; *)
@@ -110,7 +109,6 @@ def test_a_host_where_that_release_runs_holds_up_nobody(capsys: Printed) -> None
     ("host", "words", "status"),
     [
         ("bad", ["rolled", "back"], ExitCode.ROLLED_BACK),
-        ("old", ["failed"], ExitCode.NO_HOST),
         ("mad", ["lost"], ExitCode.NO_HOST),
         ("lost", ["lost"], ExitCode.NO_HOST),
         ("cut", ["lost"], ExitCode.NO_HOST),
