@@ -30,13 +30,7 @@ from dora_systemd.decisions.remote.host_tables import (
     format_releases,
     row_of,
 )
-from dora_systemd.decisions.remote.hosts import (
-    NO_PROGRAM,
-    Host,
-    Way,
-    remote_command,
-    ssh_arguments,
-)
+from dora_systemd.decisions.remote.hosts import NO_PROGRAM, Host, Way, remote_command, ssh_arguments
 from dora_systemd.decisions.remote.ssh_failures import (
     SSH_FAILED,
     is_of_ssh,

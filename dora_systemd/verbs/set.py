@@ -14,10 +14,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.limits import limit_groups
-from dora_systemd.adapters.host.unit_files import (
-    LOG_RATES_FILE,
-    NODE_LIMITS_FILE,
-)
+from dora_systemd.adapters.host.unit_files import LOG_RATES_FILE, NODE_LIMITS_FILE
 from dora_systemd.adapters.runner_socket.client import order
 from dora_systemd.decisions.cell import line_rates
 from dora_systemd.decisions.cell.limits import (

@@ -26,12 +26,7 @@ from dora_systemd.cli.progress import open_progress, quiet_option
 from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.releases.deploy import (
-    Deployed,
-    DeployRequest,
-    compare,
-    deploy,
-)
+from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, compare, deploy
 from dora_systemd.verbs.releases.receive import compare_sent, receive
 from dora_systemd.verbs.start.logins import ensure_linger, logout_note
 from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest

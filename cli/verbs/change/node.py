@@ -4,12 +4,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
-from dora_systemd.cli.parameters import (
-    acting_options,
-    current_scope,
-    print_outcomes,
-    scope_options,
-)
+from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, scope_options
 from dora_systemd.decisions.cell.status import RESTART, STOP
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.verbs.facts.locks import IfInhibited

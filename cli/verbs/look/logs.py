@@ -14,13 +14,7 @@ import click
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
 from dora_systemd.cli.terminal import is_dumb, wants_colors
-from dora_systemd.decisions.logs.query import (
-    ALL_LINES,
-    OUTPUTS,
-    LogQuery,
-    is_boot,
-    parse_level,
-)
+from dora_systemd.decisions.logs.query import ALL_LINES, OUTPUTS, LogQuery, is_boot, parse_level
 from dora_systemd.decisions.logs.records import parse_filter
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -6,11 +6,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.views.objects import switch_object
-from dora_systemd.decisions.views.releases import (
-    format_history,
-    format_releases,
-    release_object,
-)
+from dora_systemd.decisions.views.releases import format_history, format_releases, release_object
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.listing import deployed_names, read_history, read_releases

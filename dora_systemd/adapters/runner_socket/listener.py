@@ -10,12 +10,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.adapters.runner_socket.client import (
-    MAX_BYTES,
-    Request,
-    error_reply,
-    parse_line,
-)
+from dora_systemd.adapters.runner_socket.client import MAX_BYTES, Request, error_reply, parse_line
 from dora_systemd.adapters.runner_socket.door import Door, listen
 from dora_systemd.adapters.runner_socket.splice import Ends, Writer, splice, taken_over
 from dora_systemd.decisions.dora.coordinator import Coordinator

@@ -11,12 +11,7 @@ from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any
 
-from dora_systemd.decisions.cell.launch import (
-    PERL,
-    LaunchPlan,
-    is_launched,
-    launcher_words,
-)
+from dora_systemd.decisions.cell.launch import PERL, LaunchPlan, is_launched, launcher_words
 from dora_systemd.decisions.cell.machines import HEAD, machine_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow

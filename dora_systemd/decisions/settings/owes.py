@@ -4,13 +4,7 @@ from collections.abc import Mapping
 from operator import or_
 from typing import Any
 
-from dora_systemd.decisions.cell.owes import (
-    Owed,
-    format_owed,
-    merge_owed,
-    owed_of,
-    parse_owed,
-)
+from dora_systemd.decisions.cell.owes import Owed, format_owed, merge_owed, owed_of, parse_owed
 from dora_systemd.decisions.settings.kinds import (
     BOOL,
     Base,

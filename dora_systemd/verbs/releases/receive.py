@@ -33,12 +33,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.locks import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.copy import newest
-from dora_systemd.verbs.releases.deploy import (
-    Deployed,
-    DeployRequest,
-    deploy,
-    present,
-)
+from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy, present
 from dora_systemd.verbs.releases.listing import root_of, store_of
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source, find_source

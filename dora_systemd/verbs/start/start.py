@@ -8,11 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Beside, Manager, Property, StageObserver
-from dora_systemd.adapters.host.unit_files import (
-    read_unit_file,
-    remove_changes,
-    remove_unit_file,
-)
+from dora_systemd.adapters.host.unit_files import read_unit_file, remove_changes, remove_unit_file
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.settings.table import USER
 from dora_systemd.decisions.unit.file import persistent_unit, says_the_same, user_of
