@@ -31,6 +31,7 @@ VARIES = re.compile(
 LOOKS = re.compile(r"doractl (list|why|logs)\b|systemctl (is-|list-|status)|journalctl\b")
 """Commands that change nothing. They are typed again until they show what is expected."""
 LOOK_SECONDS = 20.0
+QUOTED = re.compile(r"'[^']*'|\"(?:\\.|[^\"\\])*\"|\\.")
 UNSEEN = re.compile(r"[^\n]*\r\x1b\[K|\x1b[\[(][0-9;:?]*[a-zA-Z]|\x1b[=>]")
 """A line that a command has written anew, colours, and modes of the terminal."""
 
@@ -69,6 +70,16 @@ def typed_lines(text: str) -> Iterator[Typed]:
         yield Typed(line, STATUS.sub("", shown), int(failed[1]) if failed else 0)
 
 
+def command_of(line: str) -> str:
+    """The command in a line, without the comment that follows three blanks."""
+    command = line.partition("   #")[0]
+    # The shell would take what is typed behind the command for a part of the comment, and wait.
+    assert not re.search(r"(?:^|[\s;&|()])#", QUOTED.sub("Q", command)), (
+        f"write at least three blanks before #: {line}"
+    )
+    return command
+
+
 def as_text(line: str, shown: str, status: int) -> str:
     """One line and what it has shown, as such a text has them."""
     return f"$ {line}\n{UNSEEN.sub('', shown)}" + (f"(exit status {status})\n" if status else "")
@@ -99,7 +110,7 @@ class Shell:
 
     def run(self, line: str) -> tuple[str, int]:
         """What a line shows, and its exit status."""
-        command = line.partition("   #")[0]
+        command = command_of(line)
         self.type(f'{command}; echo "{DONE} $?"')
         if key := self._keys.get(command.strip()):
             self.read_until(key[0], 60, keep=True)

@@ -17,7 +17,7 @@ from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.cli.remote.dispatch import valued_options
 from dora_systemd.decisions.remote.command_line import part_hosts
 from dora_systemd.errors import DoraSystemdError
-from tests.system.typed import typed_lines
+from tests.system.typed import command_of, typed_lines
 from tests.unit.checkout import CHECKOUT
 from tests.unit.project.test_manpages import PAGES, all_verbs
 from tests.unit.project.test_words import MODULES, strings
@@ -129,7 +129,7 @@ def test_examples_of_manuals(page: Path) -> None:
 @pytest.mark.parametrize("path", MARKDOWN, ids=lambda path: path.name)
 def test_examples_of_texts(path: Path) -> None:
     blocks = re.findall(r"^```\n(.*?)^```", text := path.read_text(), re.DOTALL | re.MULTILINE)
-    check(one.line.partition("   #")[0] for block in blocks for one in typed_lines(block))
+    check(command_of(one.line) for block in blocks for one in typed_lines(block))
     inline = re.findall(r"`([^`]*)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
     check(
         (
@@ -139,6 +139,19 @@ def test_examples_of_texts(path: Path) -> None:
         ),
         True,
     )
+
+
+@pytest.mark.parametrize("line", ["doractl list  # all", "# all", "true;# all", "echo '#' # all"])
+def test_a_comment_too_near_is_named(line: str) -> None:
+    """A test that types the line would wait until its end: the comment hides what comes after."""
+    with pytest.raises(AssertionError, match="at least three blanks before #"):
+        command_of(line)
+
+
+def test_a_comment_and_what_looks_like_one() -> None:
+    assert command_of("doractl list   # all, it's short") == "doractl list"
+    for line in ("sed -i '$a # faster' x.py", 'echo "a # b"', "echo a#b $# \\#c"):
+        assert command_of(line) == line
 
 
 @pytest.mark.parametrize("path", TASKS, ids=lambda path: path.stem)
