@@ -19,11 +19,13 @@ NO_MEMORY = not Path("/sys/fs/cgroup/cgroup.controllers").read_text().count("mem
 """Containers whose kernel has memory in cgroup v1 refuse a limit, as doractl should."""
 KEYS = {"doractl top": ("plot", b"q"), "doractl run": ("frame ", b"\x03")}
 """Commands that wait for a key: when to press it, and which."""
-FROM_NOTHING = ("README.md", "docs/first-steps.md")
-WITH_ROBOT = ("docs/run-at-boot.md",)
+FROM_NOTHING = ("README.md", "docs/first-steps.md", "docs/robot-arm.md")
+WITH_ROBOT = tuple(
+    f"docs/{name}.md" for name in ("run-at-boot", "logs", "sandbox", "releases", "monitoring")
+)
 """Pages about a robot that is already in PLACE."""
-PLACE = Path("/srv/robot")
-EXAMPLE = Path("/usr/share/doc/dora-systemd/examples/robot")
+PLACE, ARM = Path("/srv/robot"), Path("/srv/arm")
+EXAMPLES = Path("/usr/share/doc/dora-systemd/examples")
 
 
 def lines_of(page: str) -> Iterator[Typed]:
@@ -37,9 +39,9 @@ def lines_of(page: str) -> Iterator[Typed]:
 def installed() -> Iterator[None]:
     reserve_ports()
     packages.install()
-    if not EXAMPLE.exists():
+    if not EXAMPLES.exists():
         # The image leaves out /usr/share/doc, as images of containers do.
-        shutil.copytree(packages.ROBOT, EXAMPLE)
+        shutil.copytree(packages.ROBOT.parent, EXAMPLES)
     yield
     packages.apt("purge", "--yes", *packages.PACKAGES)
 
@@ -53,19 +55,19 @@ def shell(installed: None) -> Iterator[Shell]:
     yield shell
     shell.end()
     sh("doractl destroy --force")
-    sh(f"rm -rf {PLACE}")
+    sh(f"rm -rf {PLACE} {ARM}")
 
 
 @pytest.mark.parametrize("page", [*FROM_NOTHING, *WITH_ROBOT])
 def test_it_prints_what_stands_there(shell: Shell, page: str) -> None:
     wrong = []
     if page in WITH_ROBOT:
-        shutil.copytree(EXAMPLE, PLACE)
+        shutil.copytree(EXAMPLES / "robot", PLACE)
         packages.make_venv(PLACE / ".venv")
     for typed in lines_of(page):
         if "pip install" in typed.line:
             # The lab's machines reach no index; theirs is the same, from the image.
-            packages.make_venv(PLACE / ".venv")
+            packages.make_venv((ARM if "arm" in page else PLACE) / ".venv")
             continue
         shown, status = type_line(shell, typed)
         if NO_MEMORY and "memory" in typed.line:

@@ -22,10 +22,11 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 STATUS = re.compile(r"\(exit status (\d+)\)\s*\Z")
 VARIES = re.compile(
     r"(?P<uuid>[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-(?:\.\.\.|[0-9a-f]{12})|\b[0-9a-f]{8}\b)"
+    r"|(?P<release>\b\d{8}T\d{6}\b)"
     r"|(?P<date>\b\d{4}-\d\d-\d\d\b)"
     r"|(?P<time>[A-Z][a-z]{2} \d\d \d\d:\d\d:\d\d|\d\d:\d\d:\d\d)"
     r"|(?P<span>\b\d+(?:\.\d+)?(?:ms|s|min)\b)"
-    r"|(?P<number>\b\d+(?:\.\d+)?(?:%|M| MB)?(?=\s|$))|\.*##+\.*"
+    r"|(?P<number>\b\d+(?:\.\d+)?(?:%|K|M| MB)?(?=\s|$))|\.*##+\.*"
 )
 """What differs each time: it is compared by its kind."""
 LOOKS = re.compile(r"doractl (list|why|logs)\b|systemctl (is-|list-|status)|journalctl\b")

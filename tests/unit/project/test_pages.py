@@ -1,0 +1,33 @@
+"""README and pages of docs/: what stands in them without being typed is checked here."""
+
+import re
+
+import yaml
+
+from dora_systemd.decisions.views import prometheus
+from dora_systemd.decisions.views.prometheus import Family
+from tests.unit.checkout import CHECKOUT
+
+PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+
+
+def test_links_lead_somewhere() -> None:
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
+            assert "://" in target or (page.parent / target).exists(), (page.name, target)
+
+
+def test_readme_is_short() -> None:
+    assert len((CHECKOUT / "README.md").read_text().splitlines()) <= 200
+
+
+def test_alerts_are_about_metrics_that_exist() -> None:
+    families = [one for one in vars(prometheus).values() if isinstance(one, Family)]
+    families += [*prometheus.GROUP_FAMILIES, *(one for _, one in prometheus.FACT_FAMILIES)]
+    names = {one.name for one in families}
+    text = (CHECKOUT / "docs/monitoring.md").read_text()
+    blocks = [yaml.safe_load(one) for one in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]
+    rules = [rule for one in blocks for group in one.get("groups", []) for rule in group["rules"]]
+    used = re.findall(r"dora_(?:dataflow|node)_(\w+)", " ".join(rule["expr"] for rule in rules))
+    assert len(rules) == 7
+    assert not set(used) - names
