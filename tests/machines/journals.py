@@ -8,7 +8,8 @@ from functools import partial
 import pytest
 
 from tests.machines.wires import OTHERS, there
-from tests.system.complaints import Journalctl, complaints, end_of_journal, journalctl
+from tests.system.cells import journalctl
+from tests.system.complaints import Journalctl, complaints, end_of_journal
 
 LOST = (
     "flow: Machine gpu of dataflow flow is lost: ",

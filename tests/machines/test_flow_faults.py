@@ -41,6 +41,7 @@ def nothing_on(machine: str) -> bool:
 @lost
 @killed
 @pytest.mark.warns("SIGKILL", "b: systemd: dora-flow")
+@pytest.mark.warns("flow/daemon: dora_daemon: daemon disconnected from coordinator: ")
 @pytest.mark.parametrize(
     ("machine", "pattern"),
     [

@@ -103,6 +103,12 @@ def sync_journal() -> None:
     wait_for("journald", lambda: run("journalctl", "-q", "-o", "cat", mark).stdout)
 
 
+def journalctl(*words: str, check: bool = True) -> str:
+    """What it prints, of everything that was sent to journald until now."""
+    sync_journal()
+    return run("journalctl", "--quiet", *words, check=check).stdout
+
+
 class Project:
     """A directory with a dataflow, readable for everyone."""
 
@@ -198,8 +204,8 @@ class Cell:
     def journal(self, *matches: str) -> list[dict[str, Any]]:
         """The records of the unit that match, oldest first."""
         which = "--user-unit" if self.scope.is_user else "--unit"
-        command = ("journalctl", "-o", "json", "--all", which, self.unit, *matches)
-        return [json.loads(line) for line in run(*command).stdout.splitlines()]
+        lines = journalctl("-o", "json", "--all", which, self.unit, *matches).splitlines()
+        return [json.loads(line) for line in lines]
 
     def last_words(self) -> str:
         """The live table, and the newest lines of the journal that no node has printed."""

@@ -3,16 +3,11 @@
 import json
 from collections.abc import Callable, Iterable
 
-from tests.system.cells import run
+from tests.system.cells import journalctl
 from tests.system.tolerated import is_tolerated
 
 Journalctl = Callable[..., str]
 """Runs journalctl with these words; what it prints."""
-
-
-def journalctl(*words: str) -> str:
-    """That of this machine."""
-    return run("journalctl", *words, check=False).stdout
 
 
 def end_of_journal(ask: Journalctl = journalctl) -> str:

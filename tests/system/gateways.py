@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from dora_systemd.decisions.gateway.place import DEFAULT_PORT, SERVICE_UNIT, SOCKET_UNIT, token_path
 from dora_systemd.scope import Scope
-from tests.system.cells import run, wait_for
+from tests.system.cells import journalctl, run, wait_for
 
 
 class Reply(NamedTuple):
@@ -82,7 +82,7 @@ class Front:
         """What the gateway has written in this test."""
         which = "--user-unit" if self.scope.is_user else "--unit"
         since = f"--since=@{self.begun:.6f}"
-        return run("journalctl", "-q", "-o", "cat", since, which, SERVICE_UNIT).stdout
+        return journalctl("-o", "cat", since, which, SERVICE_UNIT)
 
     def wait_resting(self) -> None:
         """Return when the gateway has ended."""

@@ -10,7 +10,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope
-from tests.system.cells import Cell, Project, run, sync_journal, wait_for
+from tests.system.cells import Cell, Project, journalctl, run, wait_for
 from tests.system.refusals import Refusal, check_refusals
 
 SECRET = "correct-horse-battery-staple"
@@ -56,8 +56,7 @@ def environments() -> Iterator[str]:
 
 
 def assert_hidden(cell: Cell) -> None:
-    sync_journal()
-    journal = run("journalctl", "-o", "json", "--all", "-S", "-10min").stdout
+    journal = journalctl("-o", "json", "--all", "-S", "-10min")
     assert cell.unit in journal
     for text in (
         cell.doractl("show", cell.name).stdout,
@@ -127,10 +126,10 @@ def test_user_scope(project: Project) -> None:
     words = ("start", str(flow_of(project)), "--name", "hers", "--credential", f"token={token}")
     try:
         run(*become, "doractl", *words)
-        journal = ("journalctl", "-o", "json", f"_UID={alice.pw_uid}", "DORA_NODE=reader")
+        journal = ("-o", "json", f"_UID={alice.pw_uid}", "DORA_NODE=reader")
 
         def read() -> list[str]:
-            lines = run(*journal, "DORA_DATAFLOW_NAME=hers").stdout.splitlines()
+            lines = journalctl(*journal, "DORA_DATAFLOW_NAME=hers").splitlines()
             return [m for m in (json.loads(one)["MESSAGE"] for one in lines) if m[:4] == "read"]
 
         wait_for("the node reads it", read)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import Cell, Project, journalctl, run, wait_for
 from tests.system.homes import Home
 from tests.system.releases import Releases, write_version
 
@@ -50,8 +50,7 @@ def is_loaded(unit: str) -> bool:
 
 def printed(cell: Cell, field: str = "_SYSTEMD_UNIT") -> list[dict[str, str]]:
     """What builds have printed, from the journal."""
-    run("journalctl", "--sync")
-    found = run("journalctl", f"{field}={built_unit(cell)}", "-o", "json").stdout
+    found = journalctl(f"{field}={built_unit(cell)}", "-o", "json")
     return [json.loads(line) for line in found.splitlines()]
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import run
+from tests.system.cells import run, sync_journal
 from tests.system.homes import Home
 from tests.system.releases import STORE, Releases
 
@@ -62,7 +62,7 @@ def secret() -> Iterator[Path]:
 @pytest.mark.usefixtures("secret")
 def test_a_build_sees_and_changes_nothing_else(releases: Releases, eve: Home) -> None:
     run("logger", WORDS)
-    run("journalctl", "--sync")
+    sync_journal()
     build = TRIES.replace("SECRET", str(SECRET)).replace("STORE", str(STORE))
     eve.write("build.sh", build.replace("TARGET", "systemd-journald.service"))
     releases.deploy(eve.root, "--soak", "0s", "--credential", f"key={SECRET}")

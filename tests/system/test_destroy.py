@@ -11,7 +11,7 @@ import pytest
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.scope import Scope
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, is_alive, run, wait_for
+from tests.system.cells import Cell, Project, is_alive, journalctl, run, wait_for
 from tests.system.gateways import Front
 from tests.system.test_stop import DEAF
 
@@ -53,7 +53,7 @@ def test_all_of_it(front: Front, cell: Cell, others: list[Cell], project: Projec
     assert not list(Path("/run/systemd/system").glob("dora-gateway*"))
     assert front.doractl("destroy").stdout == NOTHING
     assert front.doractl("destroy", "--force").stdout == NOTHING
-    asked = run("journalctl", "-q", "-o", "cat", f"DORA_DATAFLOW_NAME={cell.name}").stdout
+    asked = journalctl("-o", "cat", f"DORA_DATAFLOW_NAME={cell.name}")
     assert "root (doractl destroy)" in asked
 
 

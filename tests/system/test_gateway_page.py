@@ -5,7 +5,7 @@ import json
 import pytest
 
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
-from tests.system.cells import TICK, Cell, Project, run, wait_for
+from tests.system.cells import TICK, Cell, Project, journalctl, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
 from tests.system.pages import CONTRAST, node
@@ -144,14 +144,9 @@ def test_buttons(browser: Browser, cell: Cell, project: Project) -> None:
 
 def cell_notes(cell: Cell) -> list[dict[str, str]]:
     """Who has asked for the end of the dataflow."""
-    command = (
-        "journalctl",
-        "-o",
-        "json",
-        f"DORA_DATAFLOW_NAME={cell.name}",
-        "DORA_EVENT=stop-asked",
-    )
-    return [json.loads(line) for line in run(*command).stdout.splitlines()]
+    name = f"DORA_DATAFLOW_NAME={cell.name}"
+    lines = journalctl("-o", "json", name, "DORA_EVENT=stop-asked").splitlines()
+    return [json.loads(line) for line in lines]
 
 
 def test_by_keyboard(browser: Browser, cell: Cell, project: Project) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Project, run, wait_for
+from tests.system.cells import Project, journalctl, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.pages import CONTRAST
 from tests.system.releases import Releases, write_version
@@ -101,8 +101,8 @@ def test_roll_back(browser: Browser, releases: Releases, project: Project, flag:
 def committed(releases: Releases) -> list[str]:
     """Who has asked for the releases that have passed their trials."""
     name = f"DORA_DATAFLOW_NAME={releases.cell.name}"
-    command = ("journalctl", "-o", "json", name, "DORA_EVENT=release-committed")
-    return [json.loads(line)["DORA_BY"] for line in run(*command).stdout.splitlines()]
+    lines = journalctl("-o", "json", name, "DORA_EVENT=release-committed").splitlines()
+    return [json.loads(line)["DORA_BY"] for line in lines]
 
 
 @pytest.mark.warns("was rolled back: the gateway was stopped", "exited with error: Signal(15)")

@@ -10,7 +10,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT
 from tests.lab.pace import bound
-from tests.system.cells import Project, run, wait_for
+from tests.system.cells import Project, journalctl, run, wait_for
 from tests.system.gateways import Front
 from tests.system.releases import STORE, Releases, write_version
 
@@ -126,5 +126,5 @@ def test_a_stop_that_takes_longer_than_the_gateway_has(
     assert not releases.trial.exists()
     assert (releases.current(), cell.show("ActiveState")) == (second, "inactive")
     name = f"DORA_DATAFLOW_NAME={cell.name}"
-    told = run("journalctl", "-q", "-o", "cat", name, "DORA_EVENT=release-rolled-back").stdout
+    told = journalctl("-o", "cat", name, "DORA_EVENT=release-rolled-back")
     assert "the gateway was stopped" in told

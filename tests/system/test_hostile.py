@@ -11,7 +11,7 @@ import pytest
 from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 from tests.system.gateways import Front
 from tests.system.terminal import shown
 
@@ -144,7 +144,7 @@ def test_records(cell: Cell, project: Project, front: Front) -> None:
     ids = json.dumps({name: kind.message_id for name, kind in EVENTS.items()})
     cell.start(flow, "--uid", "alice", "--env", f"FLOW={cell.name}", "--env", f"IDS={ids}",
                "--env", "FLOW_UUID=44f30e60-107e-41d2-b6a8-b30cefc153ae")  # fmt: skip
-    run("journalctl", "--sync")
+    sync_journal()
     look_at_all(cell, front)
     assert "victim" not in looked_at(cell, "list", "-a")
     assert cell.doractl("why", "victim", check=False).returncode == ExitCode.NOT_FOUND

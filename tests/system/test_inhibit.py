@@ -12,7 +12,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, is_alive, run, wait_for
+from tests.system.cells import Cell, Project, is_alive, journalctl, run, wait_for
 
 ARM = """
 import fcntl, os
@@ -114,8 +114,8 @@ def refused_without_reason(cell: Cell) -> int:
 def cell_events(cell: Cell) -> list[dict[str, str]]:
     """The events of doractl inhibit about this dataflow."""
     uuid = f"DORA_DATAFLOW_NAME={cell.name}"
-    command = ("journalctl", "-o", "json", "DORA_EVENT=inhibited", uuid)
-    return [json.loads(line) for line in run(*command).stdout.splitlines()]
+    lines = journalctl("-o", "json", "DORA_EVENT=inhibited", uuid).splitlines()
+    return [json.loads(line) for line in lines]
 
 
 def test_waiting_for_the_end_of_a_lock(cell: Cell, project: Project) -> None:

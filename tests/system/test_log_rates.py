@@ -3,12 +3,11 @@
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.system.cells import Cell, Project, sync_journal, wait_for
+from tests.system.cells import Cell, Project, wait_for
 
 
 def suppressed(cell: Cell) -> list[tuple[str, str]]:
     """The nodes and limits for which this life of the unit has suppressed lines."""
-    sync_journal()
     life = f"_SYSTEMD_INVOCATION_ID={cell.show('InvocationID')}"
     found = cell.journal("DORA_EVENT=lines-suppressed", life)
     return [(one["DORA_NODE"], one["DORA_LIMIT"]) for one in found]

@@ -11,7 +11,7 @@ import pytest
 
 from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.errors import ExitCode
-from tests.system.cells import Cell, Project, run, sync_journal, wait_for
+from tests.system.cells import Cell, Project, journalctl, run, sync_journal, wait_for
 from tests.system.terminal import shown
 
 TALK = """
@@ -143,10 +143,10 @@ def test_journalctl_shows_the_same(talking: Cell) -> None:
     talking.systemctl("stop")
     sync_journal()
     ours = logs(talking, talking.name, "--node", "cam-left")
-    assert run("journalctl", "-q", "-t", f"{talking.name}/cam-left").stdout.splitlines() == ours
+    assert journalctl("-t", f"{talking.name}/cam-left").splitlines() == ours
     unit = "_SYSTEMD_USER_UNIT" if talking.scope.is_user else "_SYSTEMD_UNIT"
     fields = (f"{unit}={talking.unit}", "DORA_NODE=cam-left")
-    assert run("journalctl", "-q", *fields).stdout.splitlines() == ours
+    assert journalctl(*fields).splitlines() == ours
 
 
 def test_runs_and_selectors(talking: Cell) -> None:
@@ -235,7 +235,7 @@ def test_forged_names_and_nodes_do_not_count(talking: Cell) -> None:
     send = "import sys; from dora_systemd.adapters.journal.note import send_note as send; "
     send += "send('\\n'.join([*sys.argv[1:], '']).encode())"
     run("runuser", "-u", "alice", "--", sys.executable, "-c", send, *fields, *own)
-    wait_for("it", lambda: run("journalctl", "-q", "-o", "cat", f"DORA_DATAFLOW={UUID}").stdout)
+    wait_for("it", lambda: journalctl("-o", "cat", f"DORA_DATAFLOW={UUID}"))
     for words in ((f"{talking.name}x*",), (UUID[:8],), (talking.name, "--node", "forg*")):
         done = talking.doractl("logs", *words, check=False)
         assert done.returncode == ExitCode.NOT_FOUND, done.stdout

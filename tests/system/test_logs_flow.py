@@ -15,7 +15,7 @@ import pytest
 
 from dora_systemd.decisions.logs.journal_events import EVENTS
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import Cell, Project, journalctl, run, wait_for
 from tests.system.terminal import shown
 
 LINES = int(os.environ.get("DORA_LOG_LINES", "30000"))
@@ -56,9 +56,8 @@ thread.join()
 
 def printed(cell: Cell, node: str, *matches: str) -> list[str]:
     """What a node printed, quickly: there may be a million lines."""
-    run("journalctl", "--sync")
     where = (f"_SYSTEMD_UNIT={cell.unit}", f"DORA_NODE={node}", "DORA_STREAM=stdout")
-    lines = run("journalctl", "-q", "-o", "cat", *where, *matches).stdout.splitlines()
+    lines = journalctl("-o", "cat", *where, *matches).splitlines()
     return [line for line in lines if OURS.match(line)]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.system.cells import run
+from tests.system.cells import run, sync_journal
 
 ROOT = Path(__file__).parents[2]
 
@@ -25,7 +25,7 @@ def pump(*arguments: str) -> dict[str, Any]:
     unit += [f"--working-directory={ROOT}"]
     module = [sys.executable, "-m", "tests.system.logpump", *arguments]
     result: dict[str, Any] = json.loads(run(*unit, *module).stdout)
-    run("journalctl", "--sync")
+    sync_journal()
     return result
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import run, wait_for
+from tests.system.cells import journalctl, run, wait_for
 
 ROOT = Path(__file__).parents[2]
 LINES = 60_000
@@ -30,9 +30,8 @@ def test_loss_is_counted(user: str) -> None:
     unit += ["--slice=dora.slice", f"--working-directory={ROOT}"]
     pump = [sys.executable, "-m", "tests.system.logpump", "--lines", str(LINES)]
     uuid = json.loads(run(*unit, *pump).stdout)["uuid"]
-    run("journalctl", "--sync")
     match = f"DORA_DATAFLOW={uuid}"
-    stored = run("journalctl", "-q", "-o", "cat", match, "DORA_STREAM=stdout").stdout.count("\n")
+    stored = journalctl("-o", "cat", match, "DORA_STREAM=stdout").count("\n")
     as_user = ["setpriv", "--reuid=1000", "--regid=1000", "--init-groups"]
     found = run(*as_user, "journalctl", "-q", "-o", "json", match, "DORA_EVENT=lines-lost").stdout
     lost = [int(json.loads(line)["DORA_COUNT"]) for line in found.splitlines()]

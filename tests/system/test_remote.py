@@ -15,7 +15,7 @@ import pytest
 from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, run, sync_journal, wait_for
+from tests.system.cells import Cell, Project, journalctl, run, sync_journal, wait_for
 from tests.system.sshds import HERE, Servers, sessions, shell_of, three_hosts
 from tests.system.terminal import Screen, Tmux, shown
 
@@ -137,7 +137,7 @@ def test_logs_of_several_hosts(cell: Cell, hers: Cell, project: Project) -> None
     times = [int(record["__REALTIME_TIMESTAMP"]) for record in records]
     assert times == sorted(times)
     matches = (f"DORA_DATAFLOW_NAME={cell.name}", "DORA_NODE=sink")
-    assert len(records) == len(run("journalctl", "-q", "-o", "cat", *matches).stdout.splitlines())
+    assert len(records) == len(journalctl("-o", "cat", *matches).splitlines())
 
 
 @pytest.mark.usefixtures("servers")

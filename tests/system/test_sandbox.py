@@ -15,7 +15,7 @@ from dora_systemd.decisions.properties.sandbox import NETWORKS
 from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.where import DEFAULT_USER
-from tests.system.cells import Cell, Project, run, sync_journal, wait_for
+from tests.system.cells import Cell, Project, journalctl, run, sync_journal, wait_for
 from tests.system.gateways import Front
 from tests.system.refusals import Refusal, check_refusals
 
@@ -144,8 +144,8 @@ def test_user_scope(project: Project, level: str) -> None:
     try:
         done = run(*become, *start)
         assert ("protects no files in user scope" in done.stderr) == (level == "strict")
-        match = ("journalctl", "-q", "-o", "cat", f"DORA_DATAFLOW_NAME={hers.name}")
-        wait_for("messages", lambda: "got [" in run(*match, "DORA_NODE=sink").stdout)
+        match = ("-o", "cat", f"DORA_DATAFLOW_NAME={hers.name}")
+        wait_for("messages", lambda: "got [" in journalctl(*match, "DORA_NODE=sink"))
         row = json.loads(run(*become, "list", hers.name, "-o", "json").stdout)
         (pid,) = [one["pid"] for one in row["nodes"] if one["node"] == "sink"]
         status = Path(f"/proc/{pid}/status").read_text()

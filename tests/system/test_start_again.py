@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.system.cells import Cell, Project, run, sync_journal, wait_for
+from tests.system.cells import Cell, Project, journalctl, run, sync_journal, wait_for
 from tests.system.faults.table import LOST
 
 SAYS = """
@@ -140,8 +140,8 @@ def test_another_users_words_start_nothing(cell: Cell, project: Project) -> None
     send = "import sys; from dora_systemd.adapters.journal.note import send_note as send; "
     send += "send('\\n'.join([*sys.argv[1:], '']).encode())"
     run("runuser", "-u", "alice", "--", sys.executable, "-c", send, *lines)
-    mine = ("journalctl", "-q", "-o", "cat", f"DORA_DATAFLOW_NAME={cell.name}")
-    wait_for("the record", lambda: run(*mine).stdout)
+    mine = ("-o", "cat", f"DORA_DATAFLOW_NAME={cell.name}")
+    wait_for("the record", lambda: journalctl(*mine))
     done = cell.doractl("start", cell.name, check=False)
     assert done.returncode == ExitCode.NOT_FOUND, done.stdout
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import Cell, Project, journalctl, run, wait_for
 
 ROLES = ("source", "doubler", "sink")
 FLOW = """
@@ -147,10 +147,9 @@ class Scene:
 
     def printed(self) -> dict[str, list[int]]:
         """The numbers that the journal has of each life, in its order."""
-        run("journalctl", "--sync")
         found: dict[str, list[int]] = {}
         where = (f"_SYSTEMD_UNIT={self.cell.unit}", "DORA_STREAM=stdout")
-        for line in run("journalctl", "-q", "-o", "cat", *where).stdout.splitlines():
+        for line in journalctl("-o", "cat", *where).splitlines():
             life, _, number = line.partition(" ")
             if life.partition(".")[0] in ROLES and number.isdecimal():
                 found.setdefault(life, []).append(int(number))
