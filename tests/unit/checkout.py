@@ -1,10 +1,13 @@
 """Where the sources are, and the package as it is when it is installed."""
 
+import ast
+from functools import cache
 from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
 
+@cache
 def module_paths() -> dict[str, Path]:
     """Every module of ours by name without "dora_systemd.", such as "values" and "cli.main"."""
     package = CHECKOUT / "dora_systemd"
@@ -13,6 +16,18 @@ def module_paths() -> dict[str, Path]:
     command = {path.relative_to(CHECKOUT): path for path in (CHECKOUT / "cli").rglob("*.py")}
     cli = {".".join(name.with_suffix("").parts): path for name, path in command.items()}
     return {name: path for name, path in (own | cli).items() if not name.endswith("__init__")}
+
+
+@cache
+def tree_of(name: str) -> ast.Module:
+    """The syntax tree of a module of ours."""
+    return ast.parse(module_paths()[name].read_text())
+
+
+@cache
+def nodes_of(name: str) -> tuple[ast.AST, ...]:
+    """All nodes of its tree: several tests search them."""
+    return tuple(ast.walk(tree_of(name)))
 
 
 def linked_package(place: Path) -> Path:

@@ -15,7 +15,8 @@ LONG = ("tests/unit/project/test_linters.py", "tests/unit/project/test_late_impo
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A busy machine is no bug: how long an example takes is not what these tests are about.
-settings.register_profile("house", deadline=None)
+# Each run draws others; `make fuzz` draws as many as one has time for.
+settings.register_profile("house", deadline=None, max_examples=40)
 settings.load_profile("house")
 
 

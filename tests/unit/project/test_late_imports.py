@@ -2,7 +2,7 @@
 
 import ast
 
-from tests.unit.checkout import module_paths
+from tests.unit.checkout import module_paths, nodes_of
 
 LATE = {
     "click takes 35 ms: no --version, and no usual list, waits for it": {
@@ -175,9 +175,8 @@ def imported(node: ast.AST) -> set[str]:
 
 def late_imports(name: str) -> set[str]:
     """What the functions of a module import."""
-    tree = ast.parse(module_paths()[name].read_text())
     kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
-    functions = [node for node in ast.walk(tree) if isinstance(node, kinds)]
+    functions = [node for node in nodes_of(name) if isinstance(node, kinds)]
     return {one for function in functions for node in ast.walk(function) for one in imported(node)}
 
 

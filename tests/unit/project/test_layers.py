@@ -10,13 +10,14 @@ import subprocess
 import sys
 import tomllib
 from collections import defaultdict
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.cli.group import SECTIONS
-from tests.unit.checkout import CHECKOUT, linked_package, module_paths
+from tests.unit.checkout import CHECKOUT, linked_package, module_paths, nodes_of
 
 LAYERS = (
     {"words"},
@@ -90,7 +91,7 @@ def folder_of(name: str) -> str:
 def imports(name: str) -> tuple[set[str], set[str]]:
     """The modules of ours that a module imports anywhere in it, and the packages of others."""
     own, others = set(), set()
-    for node in ast.walk(ast.parse(PATHS[name].read_text())):
+    for node in nodes_of(name):
         if isinstance(node, ast.ImportFrom):
             targets = {f"{node.module}.{alias.name}" for alias in node.names}
             targets = {one for one in targets if one.removeprefix("dora_systemd.") in PATHS}
@@ -104,28 +105,37 @@ def imports(name: str) -> tuple[set[str], set[str]]:
     return own, others
 
 
-@pytest.mark.parametrize("name", sorted(PATHS))
-def test_imports_go_down(name: str) -> None:
-    own, depth = house_of(name), DEPTHS[house_of(name)]
-    houses = {target: house_of(target) for target in imports(name)[0]}
-    wrong = [target for target, house in houses.items() if house != own and DEPTHS[house] >= depth]
-    assert not wrong, f"{name} must not import {', '.join(sorted(wrong))}"
+def edges(*houses: str) -> Iterator[tuple[str, str]]:
+    """The imports of modules of ours by those of these folders: who, and what."""
+    for name in modules_of(*houses):
+        yield from ((name, target) for target in sorted(imports(name)[0]))
 
 
-@pytest.mark.parametrize("name", modules_of("adapters"))
-def test_adapters_stand_alone(name: str) -> None:
-    edges = {
+def test_imports_go_down() -> None:
+    upwards = {
+        (name, target)
+        for name, target in edges(*DEPTHS)
+        if house_of(name) != house_of(target) and DEPTHS[house_of(name)] <= DEPTHS[house_of(target)]
+    }
+    assert not upwards, "a module imports one of its own layer or of a higher one"
+
+
+def test_adapters_stand_alone() -> None:
+    between = {
         (folder_of(name), folder_of(target))
-        for target in imports(name)[0]
+        for name, target in edges("adapters")
         if house_of(target) == "adapters" and folder_of(target) != folder_of(name)
     }
-    assert not edges - ADAPTERS_MAY
+    assert not between - ADAPTERS_MAY
 
 
-@pytest.mark.parametrize("name", modules_of("gateway", "cli"))
-def test_only_systemd_starts_runners_and_gateways(name: str) -> None:
-    apart = {"runner", "gateway"} - {house_of(name)}
-    assert not apart & {house_of(target) for target in imports(name)[0]}
+def test_only_systemd_starts_runners_and_gateways() -> None:
+    apart = {"runner", "gateway"}
+    assert not {
+        (name, target)
+        for name, target in edges("gateway", "cli")
+        if house_of(target) in apart - {house_of(name)}
+    }
 
 
 def test_no_module_imports_in_a_circle() -> None:
@@ -153,13 +163,13 @@ def folders() -> list[Path]:
     return sorted(path for path in found if path.name != "__pycache__" and things_in(path))
 
 
-@pytest.mark.parametrize("folder", folders(), ids=lambda path: str(path.relative_to(CHECKOUT)))
-def test_a_look_at_a_folder_is_enough(folder: Path) -> None:
+def test_a_look_at_a_folder_is_enough() -> None:
     """Neither a heap of files nor a folder for a single thing."""
-    things = things_in(folder)
-    files = [path for path in things if path.is_file()]
-    assert len(files) <= MAX_FILES, f"{len(files)} files in {folder}: sort them into folders"
-    assert len(things) > 1, f"{folder} holds one thing: put it beside the folder"
+    held = {folder: things_in(folder) for folder in folders()}
+    heaps = [one for one, things in held.items() if sum(map(Path.is_file, things)) > MAX_FILES]
+    assert not heaps, f"more than {MAX_FILES} files: sort them into folders"
+    lonely = [folder for folder, things in held.items() if len(things) < 2]
+    assert not lonely, "it holds one thing: put that beside the folder"
 
 
 def packages() -> list[Path]:
@@ -188,38 +198,49 @@ def test_every_section_of_verbs_is_installed() -> None:
     assert {path.name for path in (CHECKOUT / "cli/verbs").glob("[a-z]*")} == set(SECTIONS)
 
 
-@pytest.mark.parametrize("package", packages()[1:], ids=lambda path: path.name)
-def test_packages_load_nothing(package: Path) -> None:
+def test_packages_load_nothing() -> None:
     """Whoever imports a module from a package waits for its __init__.py, too."""
-    body = ast.parse((package / "__init__.py").read_text()).body
-    assert all(isinstance(node, ast.Expr) for node in body), "no more than a docstring"
+    bodies = {one: ast.parse((one / "__init__.py").read_text()).body for one in packages()[1:]}
+    full = [
+        package
+        for package, body in bodies.items()
+        if not all(isinstance(node, ast.Expr) for node in body)
+    ]
+    assert not full, "no more than a docstring"
 
 
-@pytest.mark.parametrize("name", sorted(PATHS))
-def test_each_outside_thing_has_one_importer(name: str) -> None:
-    foreign = {one for one in imports(name)[1] if name not in ONLY_IMPORTERS.get(one, {name})}
-    assert not foreign, f"{name} must not import {', '.join(sorted(foreign))}"
+def test_each_outside_thing_has_one_importer() -> None:
+    foreign = {
+        (name, one)
+        for name in PATHS
+        for one in imports(name)[1]
+        if name not in ONLY_IMPORTERS.get(one, {name})
+    }
+    assert not foreign, "another module is the one that imports this package"
 
 
-@pytest.mark.parametrize("name", sorted({*modules_of("words"), *modules_of("decisions")}))
-def test_words_and_decisions_need_python_only(name: str) -> None:
-    others = imports(name)[1] - sys.stdlib_module_names
-    assert others == LIBRARIES_OF_DECISIONS.get(name, set())
+def test_words_and_decisions_need_python_only() -> None:
+    names = modules_of("words", "decisions")
+    found = {name: imports(name)[1] - sys.stdlib_module_names for name in names}
+    assert {name: others for name, others in found.items() if others} == LIBRARIES_OF_DECISIONS
 
 
-@pytest.mark.parametrize("name", modules_of("decisions"))
-def test_decisions_are_pure(name: str) -> None:
-    tree = ast.parse(PATHS[name].read_text())
-    impure = imports(name)[1] & IMPURE
-    clocks = {
+def test_decisions_are_pure() -> None:
+    names = modules_of("decisions")
+    used = {name: imports(name)[1] & IMPURE | clocks_of(name) for name in names}
+    assert not {name: impure for name, impure in used.items() if impure}
+
+
+def clocks_of(name: str) -> set[str]:
+    """The clocks that a module reads."""
+    return {
         node.attr
-        for node in ast.walk(tree)
+        for node in nodes_of(name)
         if isinstance(node, ast.Attribute)
         and node.attr in CLOCKS
         and isinstance(node.value, ast.Name)
         and node.value.id in ("time", "datetime", "date")
     }
-    assert not impure | clocks, f"{name} uses {', '.join(sorted(impure | clocks))}"
 
 
 def loaded_by(code: str, directory: Path) -> set[str]:
@@ -274,16 +295,15 @@ CALLS_OF_PROGRAMS |= {"fork", "posix_spawn", "posix_spawnp", "system", "popen", 
 
 def called(name: str) -> set[str]:
     """The names after a dot that a module uses."""
-    tree = ast.parse(module_paths()[name].read_text())
     return {
         node.func.attr
-        for node in ast.walk(tree)
+        for node in nodes_of(name)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
     }
 
 
 def test_who_starts_programs() -> None:
-    found = {name for name in module_paths() if called(name) & CALLS_OF_PROGRAMS}
+    found = {name for name in PATHS if called(name) & CALLS_OF_PROGRAMS}
     assert found == STARTS_PROGRAMS.keys()
 
 
@@ -292,14 +312,13 @@ ASKS_ROOTS_DORA = {"verbs.doctor", "verbs.version"}
 """They ask for a version only, of a dora that is root's when root asks."""
 
 
-@pytest.mark.parametrize("name", modules_of("verbs", "gateway", "cli"))
-def test_dora_is_run_in_cells_only(name: str) -> None:
-    tree = ast.parse(PATHS[name].read_text())
-    imported = {
-        alias.name
-        for node in ast.walk(tree)
+def test_dora_is_run_in_cells_only() -> None:
+    used = {
+        (name, alias.name)
+        for name in modules_of("verbs", "gateway", "cli")
+        for node in nodes_of(name)
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
+        if alias.name in RUNS_DORA
     }
-    allowed = {"dora_version"} if name in ASKS_ROOTS_DORA else set()
-    assert not (imported & RUNS_DORA) - allowed
+    assert not used - {(name, "dora_version") for name in ASKS_ROOTS_DORA}
