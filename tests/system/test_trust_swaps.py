@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.plan import Plan, make_plan
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.lab
 
 ROUNDS = int(os.environ.get("SWAP_ROUNDS") or 40)
 SECRET = "known-to-root-alone"
+SCOPE = Scope(False, 0)
 
 SWAP = """
 import ctypes, os, signal, sys
@@ -76,7 +78,7 @@ def swapping(one: Path, other: Path) -> Iterator[None]:
 
 def plan(flow: Path) -> Plan:
     """What root would start."""
-    return make_plan(Scope(False, 0), StartRequest(str(flow), "swapped"))
+    return make_plan(SCOPE, StartRequest(str(flow), "swapped"))
 
 
 def plans(one: Path, other: Path, flow: Path) -> list[Plan]:
@@ -123,7 +125,7 @@ def test_settings_command_nothing_of_roots(mallory: Home) -> None:
         found = plans(own, link, mallory.root / "dataflow.yml")
     finally:
         others.unlink()
-    texts = {format_plan(one) for one in found}
+    texts = {format_plan(one, lambda: Bus(SCOPE)) for one in found}
     assert not [text for text in texts if "User=mallory" not in text or str(secret) in text]
 
 
@@ -146,6 +148,7 @@ def test_no_bind_mount_leads_elsewhere(mallory: Home) -> None:
     link.symlink_to(home)
     mallory.write("dataflow.systemd.yml", "writable: [out]\n")
     found = plans(place, link, mallory.root / "dataflow.yml")
-    lines = {line for one in found for line in format_plan(one).splitlines()}
+    texts = {format_plan(one, lambda: Bus(SCOPE)) for one in found}
+    lines = {line for text in texts for line in text.splitlines()}
     binds = {line for line in lines if line.startswith(("BindPaths=", "BindReadOnlyPaths="))}
     assert not [line for line in binds if "/home/bob" in line or str(mallory.root) in line]

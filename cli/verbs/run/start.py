@@ -111,7 +111,7 @@ def command(
         target = boot_target(Bus(scope), scope) if want_boot else None
         plan = make_plan(scope, request)
         check_plan(lambda: Bus(scope), plan)
-        write_exactly(format_plan(plan, target))
+        write_exactly(format_plan(plan, lambda: Bus(scope), target))
         return ExitCode.OK
     bus = Bus(scope)
     if want_push:

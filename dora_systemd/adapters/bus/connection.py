@@ -29,6 +29,8 @@ _BUS_SECONDS = 1.0
 """Timeout for the first message from the message bus, if there is another way."""
 _TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
 """The only way to set the timeout of sd-bus through pystemd: read at a connection's first call."""
+_FIRST_PERSON = 1000
+"""Users with smaller numbers are system accounts."""
 _environment = _thread.allocate_lock()  # threading takes a while to load
 _CLOSE = (-1, None)
 """pystemd's mark for the end of a container."""
@@ -220,6 +222,10 @@ def _connection_hint(scope: Scope) -> str:
     if not scope.is_user:
         return "see systemctl is-system-running"
     user = user_name(scope.uid, nameless="")
+    if 0 < scope.uid < _FIRST_PERSON:
+        # Since systemd 258 no login of such an account starts one.
+        remedy = f"as root: loginctl enable-linger {user}"
+        return f"{user} is a system account, which needs a manager, {remedy}"
     return f"log in as {user}, or let the manager run without: loginctl enable-linger {user}"
 
 

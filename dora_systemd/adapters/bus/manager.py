@@ -133,6 +133,9 @@ class Manager(Protocol):
     def version(self) -> str:
         """The systemd version, as in "257.13-1"."""
 
+    def property_types(self) -> Mapping[str, str]:
+        """The D-Bus signatures of all properties that services have, by name."""
+
 
 def queued_job(properties: Mapping[str, Any]) -> int:
     """The id in Job=; 0 if no job is queued, or systemd has not found the unit."""

@@ -1,7 +1,8 @@
 """Talks to systemd over D-Bus; the methods of Bus are the only calls to it.
 
 The interfaces are those of org.freedesktop.systemd1(5). Bus uses the low level of pystemd and
-passes the signature of every argument itself. So it needs no introspection and parses no XML.
+passes the signature of every argument itself, so it needs no introspection; `property_types` is for
+properties that the product does not know.
 
 Properties belong to an interface: _UNIT_PROPERTIES lists those that are read from the Unit
 interface; all others are read from the interface of the unit's type. A Unit property that is
@@ -12,6 +13,7 @@ signal of a short job could arrive before the subscription, and get lost. Signal
 anyway when the message bus restarts, so the wait also reads the state of the units once a second.
 """
 
+import re
 import select
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -37,6 +39,7 @@ BY_TYPE = {
     "slice": b"org.freedesktop.systemd1.Slice",
 }
 PROPERTIES = b"org.freedesktop.DBus.Properties"
+INTROSPECTABLE = b"org.freedesktop.DBus.Introspectable"
 
 _IDLE_SECONDS = 1.0
 _ENDING = ("StopUnit", "RestartUnit")
@@ -174,6 +177,14 @@ class Bus:
 
     def version(self) -> str:
         return str(self._get("read systemd's version", "Version"))
+
+    def property_types(self) -> dict[str, str]:
+        # All services have the same, and systemd answers for one that it does not know as well.
+        action, path = "read the properties of services", _unit_path("dora.service")
+        text = str(self._call(action, "Introspect", path=path, interface=INTROSPECTABLE))
+        own = text.partition(f'<interface name="{BY_TYPE["service"].decode()}">')[2]
+        own = own.partition("</interface>")[0]
+        return dict(re.findall(r'<property name="(\w+)" type="([^"]+)"', own))
 
     def fileno(self) -> int:
         return int(self._bus.get_fd())

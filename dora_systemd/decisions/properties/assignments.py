@@ -1,10 +1,18 @@
 """Parses and joins properties of one unit, from assignments as for `--property`."""
 
+import re
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.decisions.properties.kinds import Property
-from dora_systemd.decisions.properties.table import RLIMITS, TABLE, Row
+from dora_systemd.decisions.properties.table import (
+    RLIMITS,
+    TABLE,
+    TABLE_VERSION,
+    Row,
+    bus_name,
+    plain_kind,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import STORE, did_you_mean
 from dora_systemd.values import quoted, shown
@@ -14,6 +22,7 @@ Properties = Mapping[str, Property]
 later value of a slot replaces the earlier one or, for lists, is appended. Two slots can have the
 same name on D-Bus: ConditionPathExists and ConditionHost are both Conditions."""
 
+_WORD = re.compile("[a-z][a-z0-9-]*")
 _DOUBLE_KEYS = {"TimeoutSec": ("TimeoutStartSec", "TimeoutStopSec")}
 
 _SUPERVISED = "dora-systemd needs it to supervise the dataflow"
@@ -29,6 +38,7 @@ _REFUSED = {
     "StandardInput": "its end is the end of `doractl run`",
     "SetCredential": "everybody could read it in the unit, unlike LoadCredential=ID:PATH",
 }
+_DROP_IN = "write it into a drop-in instead: systemctl edit dora-NAME.service"
 _UNSUPPORTED = (
     *("OpenFile", "NFTSet", "MountImages", "ExtensionImages", "RootImageOptions", "RootHash"),
     *("RootHashSignature", "SocketBindAllow", "SocketBindDeny", "SetCredentialEncrypted"),
@@ -37,21 +47,64 @@ _UNSUPPORTED = (
 )
 
 
-def parse_property(assignment: str) -> dict[str, Property]:
+class Newer(NamedTuple):
+    """What a systemd has, to judge what the table does not know."""
+
+    version: int
+    types: Mapping[str, str]  # signatures of a service's properties by name on D-Bus
+
+
+NOTHING_NEWER = Newer(TABLE_VERSION, {})
+
+
+def parse_property(assignment: str, newer: Newer = NOTHING_NEWER) -> dict[str, Property]:
     """The properties that KEY=VALUE sets, by slot: one, or two for a resource limit.
 
-    Keys and values are those of systemd-run(1) --property. Raises DoraSystemdError (USAGE) for a
-    key that services do not have or that dora-systemd sets itself, and for a bad value.
+    Keys and values are those of systemd-run(1) --property, and what only `newer` knows. Raises
+    DoraSystemdError (USAGE) for a key that services do not have or that dora-systemd sets itself,
+    and for a bad value.
     """
     key, equals, text = assignment.partition("=")
     if not equals:
         raise _refusal(f"{quoted(assignment)}: it has no value", "write KEY=VALUE, such as Nice=5")
     properties: dict[str, Property] = {}
     for one in _DOUBLE_KEYS.get(key, (key,)):
-        _check_key(one)
+        _check_key(one, newer)
         _check_directory(one, text)
-        properties |= parse_line(one, text)
+        properties |= _parse_newer(one, text, newer) or parse_line(one, text)
     return properties
+
+
+def unknown_keys(assignments: Iterable[str]) -> list[str]:
+    """The keys of those that the table does not take: they are wrong, or for a newer systemd."""
+    return [one.partition("=")[0] for one in assignments if not _is_known(one)]
+
+
+def _is_known(assignment: str) -> bool:
+    try:
+        parse_property(assignment)
+    except DoraSystemdError:
+        return False
+    return True
+
+
+def _parse_newer(key: str, text: str, newer: Newer) -> dict[str, Property]:
+    """A property that is not in the table, or one with a word that is not; {} for all others."""
+    if key not in TABLE:
+        signature = newer.types[bus_name(key)]
+        kind = plain_kind(key, signature)
+        if not kind:
+            raise _refusal(f"{shown(key)} from here", _DROP_IN)
+        try:
+            return {key: Property(bus_name(key), signature, kind.parse(text))}
+        except (ValueError, DoraSystemdError):
+            raise _refusal(f"{key} to {quoted(text)}", f"write {kind.expected}") from None
+    word = text.strip()
+    if newer.version > TABLE_VERSION and _WORD.fullmatch(word) and not _is_known(f"{key}={word}"):
+        for name, kind in TABLE[key].choices:
+            if kind.is_choice:
+                return {key: Property(name, "s", word)}
+    return {}
 
 
 def parse_line(key: str, text: str) -> dict[str, Property]:
@@ -73,11 +126,13 @@ def typed(**values: Any) -> dict[str, Property]:
     return {key: Property(rows[key][0], rows[key][1].signature, values[key]) for key in values}
 
 
-def with_assignments(properties: Properties, assignments: Iterable[str]) -> dict[str, Property]:
+def with_assignments(
+    properties: Properties, assignments: Iterable[str], newer: Newer = NOTHING_NEWER
+) -> dict[str, Property]:
     """`properties`, then each KEY=VALUE. Raises DoraSystemdError as parse_property does."""
     result = dict(properties)
     for assignment in assignments:
-        result = with_properties(result, parse_property(assignment))
+        result = with_properties(result, parse_property(assignment, newer))
     return result
 
 
@@ -98,13 +153,13 @@ def format_property(slot: str, properties: Properties) -> list[str]:
     A soft resource limit is part of its hard one. A value that a unit file cannot express becomes a
     comment.
     """
-    name, _, value = properties[slot]
+    name, signature, value = properties[slot]
     key = slot.removesuffix("~")
     if key.endswith("Soft") and key.removesuffix("Soft") in RLIMITS:
         return []
-    if key not in TABLE:
+    kind = dict(TABLE[key].choices)[name] if key in TABLE else plain_kind(key, signature)
+    if not kind:
         return [f"# {name} is set by doractl"]
-    kind = dict(TABLE[key].choices)[name]
     text = kind.format(value)
     soft = properties.get(f"{key}Soft")
     if soft and soft.value != value:
@@ -112,13 +167,12 @@ def format_property(slot: str, properties: Properties) -> list[str]:
     return [f"{key}={line}" for line in text.split("\n")]
 
 
-def _check_key(key: str) -> None:
+def _check_key(key: str, newer: Newer) -> None:
     if key in _REFUSED:
         raise _refusal(f"{shown(key)}: {_REFUSED[key]}", "leave it out")
     if key in _UNSUPPORTED:
-        hint = "write it into a drop-in instead: systemctl edit dora-NAME.service"
-        raise _refusal(f"{shown(key)} from here", hint)
-    if key not in TABLE:
+        raise _refusal(f"{shown(key)} from here", _DROP_IN)
+    if key not in TABLE and bus_name(key) not in newer.types:
         hint = did_you_mean(key, TABLE.keys() - _REFUSED.keys()) or "see systemd.directives(7)"
         raise _refusal(f"{shown(key)}: services have no such property", hint)
 

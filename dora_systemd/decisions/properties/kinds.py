@@ -49,6 +49,7 @@ class PropertyKind:
     parse: Callable[[str], Any]  # text to value; raises ValueError or DoraSystemdError
     # value to the text after "KEY="; after a newline, that of one more line with this key
     format: Callable[[Any], str]
+    is_choice: bool = False  # one of some words, of which a newer systemd may have more
 
 
 def plain_text(text: str) -> str:
@@ -99,7 +100,7 @@ def number_kind(signature: str, lowest: int, highest: int) -> PropertyKind:
 
 def choice_kind(*choices: str) -> PropertyKind:
     """One of some words; if "yes" and "no" are among them, all boolean words are valid."""
-    kind = word_kind("s", {choice: choice for choice in choices})
+    kind = replace(word_kind("s", {choice: choice for choice in choices}), is_choice=True)
     if not {"yes", "no"} <= {*choices}:
         return kind
 

@@ -26,6 +26,9 @@ from dora_systemd.decisions.properties import kinds, lists, numbers, structs
 from dora_systemd.decisions.properties.kinds import PropertyKind, choice_kind, number_kind
 from dora_systemd.decisions.properties.lists import condition_kind
 
+TABLE_VERSION = 257
+"""The version of systemd whose properties and words these are."""
+
 UNIT = "Unit"
 SERVICE = "Service"
 
@@ -210,6 +213,16 @@ _ODD: dict[str, Sequence[tuple[str, PropertyKind]]] = {
     ],
 }
 
+_PLAIN = {
+    "b": kinds.BOOL,
+    "s": kinds.TEXT,
+    "as": lists.WORDS,
+    "i": number_kind("i", -(2**31), 2**31 - 1),
+    "u": _NUMBER,
+    "t": kinds.SIZE_LIMIT,
+}
+"""Kinds of properties that are not in the table, by type."""
+
 _EXTENDED = {
     "PrivateTmp": choice_kind("disconnected"),
     "PrivateUsers": choice_kind("self", "identity", "full"),
@@ -218,14 +231,21 @@ _EXTENDED = {
 """Booleans at first; for later values there is a second property on D-Bus."""
 
 
+def bus_name(key: str) -> str:
+    """The usual name on D-Bus of a key: ...Sec is ...USec, except for TimerSlackNSec."""
+    return re.sub("(?<!N)Sec$", "USec", key)
+
+
+def plain_kind(key: str, signature: str) -> PropertyKind | None:
+    """The kind of a property that is not in the table, by its type; None for other types."""
+    is_duration = signature == "t" and key.endswith("Sec")
+    return kinds.DURATION if is_duration else _PLAIN.get(signature)
+
+
 def _plain_rows() -> Iterator[Row]:
     for section, rows in ((SERVICE, _SERVICE_KEYS), (UNIT, _UNIT_KEYS)):
         for kind, keys in rows:
-            # On D-Bus ...Sec is ...USec, except for TimerSlackNSec.
-            yield from (
-                Row(key, section, [(re.sub("(?<!N)Sec$", "USec", key), kind)])
-                for key in keys.split()
-            )
+            yield from (Row(key, section, [(bus_name(key), kind)]) for key in keys.split())
 
 
 def _rows() -> Iterator[Row]:
@@ -258,6 +278,7 @@ def _output_choices(key: str) -> Sequence[tuple[str, PropertyKind]]:
 
 TABLE = {row.key: row for row in _rows()}
 """Every row by its key."""
+
 
 RLIMITS = frozenset(f"Limit{name}" for name in _RLIMIT_KINDS)
 """Keys that are two properties on D-Bus: the hard limit LimitX and the soft limit LimitXSoft."""

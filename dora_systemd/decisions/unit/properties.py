@@ -19,6 +19,8 @@ from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.life.stop_budget import unit_timeout
 from dora_systemd.decisions.needs.units import NETWORK_UNIT, device_entries, needs_properties
 from dora_systemd.decisions.properties.assignments import (
+    NOTHING_NEWER,
+    Newer,
     Properties,
     format_property,
     parse_line,
@@ -62,6 +64,7 @@ class UnitContext:
     credentials: Mapping[str, str] = field(default_factory=dict)  # absolute path by name
     sandbox: Sandbox | None = None  # None for no sandbox
     clock: str = ""  # the service that waits for the right time, or ""
+    newer: Newer = NOTHING_NEWER  # what judges a --property that the table does not know
 
 
 def unit_properties(
@@ -93,7 +96,7 @@ def unit_properties(
     properties = with_properties(properties, of_machines)
     assignments = settings[PROPERTY]
     try:
-        return with_assignments(properties, assignments)
+        return with_assignments(properties, assignments, context.newer)
     except DoraSystemdError as error:
         message = f"{error.message} ({settings.source(PROPERTY)})"
         raise DoraSystemdError(message, error.hint, error.code) from error
@@ -181,6 +184,7 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
 def cgroup_properties() -> dict[str, Property]:
     """A delegated cgroup with accounting and without limits, see systemd.resource-control(5).
 
+    CPU time is always accounted for: systemd 262 has no CPUAccounting= any more.
     TasksMax=infinity: systemd's default would be an implicit limit. LimitMEMLOCK=infinity, see
     systemd.exec(5): each node of dora locks 8 MiB of shared memory for messages. With systemd's
     default of 8 MiB in total nodes fall back to copying. A user's manager can only grant its own
@@ -189,7 +193,6 @@ def cgroup_properties() -> dict[str, Property]:
     return typed(
         Delegate=True,
         DelegateSubgroup="supervisor",
-        CPUAccounting=True,
         MemoryAccounting=True,
         TasksAccounting=True,
         IOAccounting=True,

@@ -2,17 +2,23 @@
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
-from dora_systemd.decisions.properties.assignments import with_properties
+from dora_systemd.decisions.properties.assignments import (
+    NOTHING_NEWER,
+    Newer,
+    unknown_keys,
+    with_properties,
+)
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, unmatched_patterns
 from dora_systemd.decisions.settings.limits import DEVICE
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.resolve import idle_warnings
+from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, drop_unsupported
@@ -38,15 +44,36 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     """
     needs, allowed = plan.settings[NEEDS], plan.settings[DEVICE]
     check_needs(manager, Needy(plan.options.name, plan.scope.is_user, needs))
-    properties, warnings = drop_unsupported(_properties(plan), systemd_number(manager))
+    number = systemd_number(manager)
+    properties, warnings = drop_unsupported(_properties(plan, lambda: manager), number)
     warnings = (
         *warnings,
+        *passed_on(plan, number),
         *idle_warnings(plan.settings),
         *watch_warnings(plan),
         *needs_warnings(needs, plan.options.needs, plan.sandbox.has_mounts, allowed),
     )
     warnings = (*warnings, *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))
+
+
+def passed_on(plan: Plan, systemd_version: int) -> Iterator[str]:
+    """A note for each property that only systemd can judge."""
+    assignments = plan.settings[PROPERTY]
+    for key in unknown_keys(assignments):
+        yield (
+            f"{key}= is passed on as it is: doractl does not know this, "
+            f"systemd {systemd_version} judges it"
+        )
+
+
+def _newer(plan: Plan, manager: Callable[[], Manager]) -> Newer:
+    """What judges a --property that doractl does not know."""
+    assignments = plan.settings[PROPERTY]
+    if not unknown_keys(assignments):
+        return NOTHING_NEWER
+    asked = manager()
+    return Newer(systemd_number(asked), asked.property_types())
 
 
 def systemd_number(manager: Manager) -> int:
@@ -71,14 +98,14 @@ def plan_links(plan: Plan) -> "list[LinkUnit]":
     ]
 
 
-def format_plan(plan: Plan, target: str | None = None) -> str:
+def format_plan(plan: Plan, manager: Callable[[], Manager], target: str | None = None) -> str:
     """The unit as the text of a unit file, below comments with its name and sources.
 
     The units of links follow. Their ExecStart= has what the member is told. target: the one that
     would start it at boot.
     """
     head = f"# {plan.unit}\n# source: {plan.options.dataflow}\n"
-    text = format_unit(_properties(plan))
+    text = format_unit(_properties(plan, manager))
     if target is not None:
         text = persistent_unit([text], plan.options, plan.scope.is_user, target)
     return head + text + "".join(_format_links(plan))
@@ -90,7 +117,7 @@ def _format_links(plan: Plan) -> Iterator[str]:
         yield format_unit(link.properties)
 
 
-def _properties(plan: Plan) -> dict[str, Property]:
+def _properties(plan: Plan, manager: Callable[[], Manager]) -> dict[str, Property]:
     context = UnitContext(
         python=sys.executable,
         is_user=plan.scope.is_user,
@@ -99,6 +126,7 @@ def _properties(plan: Plan) -> dict[str, Property]:
         credentials=credential_files(plan.settings),
         sandbox=plan.sandbox,
         clock=clock_service(),
+        newer=_newer(plan, manager),
     )
     properties = dict(unit_properties(plan.options, context, plan.settings))
     if plan.members:

@@ -55,6 +55,7 @@ class FakeManager:
         self.held: set[str] = set()
         self.after_job: dict[str, dict[str, Any]] = {}
         self.systemd = "257.13-1"
+        self.types: dict[str, str] = {}
         self.questions = 0
         self.etc, self.kind = Path("/nowhere/etc"), "system"
 
@@ -206,6 +207,9 @@ class FakeManager:
 
     def version(self) -> str:
         return self.systemd
+
+    def property_types(self) -> dict[str, str]:
+        return self.types
 
     def _tell(self, observer: Observer | None) -> None:
         for stage in self.stages:

@@ -7,8 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.properties.assignments import (
+    Newer,
     format_property,
     parse_property,
+    unknown_keys,
     with_properties,
 )
 from dora_systemd.decisions.properties.kinds import SCALE, Property
@@ -107,6 +109,64 @@ def check_type(signature: str, value: Any) -> None:
 )
 def test_values(assignment: str, expected: tuple[str, str, Any]) -> None:
     assert one(assignment) == expected
+
+
+NEWER = Newer(
+    262,
+    {
+        "PrivateBPF": "b",
+        "StateDirectoryQuota": "t",
+        "NewUSec": "t",
+        "Names": "as",
+        "Count": "u",
+        "Word": "s",
+        "Pairs": "a(ss)",
+    },
+)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "expected"),
+    [
+        ("OOMPolicy=continue-on", ("OOMPolicy", "s", "continue-on")),
+        ("OOMPolicy=stop", ("OOMPolicy", "s", "stop")),
+        ("PrivateUsers=managed", ("PrivateUsersEx", "s", "managed")),
+        ("PrivateBPF=yes", ("PrivateBPF", "b", True)),
+        ("StateDirectoryQuota=5M", ("StateDirectoryQuota", "t", 5 * 2**20)),
+        ("NewSec=5", ("NewUSec", "t", 5_000_000)),
+        ("Names=a b", ("Names", "as", ("a", "b"))),
+        ("Count=3", ("Count", "u", 3)),
+        ("Word=x y", ("Word", "s", "x y")),
+    ],
+)
+def test_what_a_newer_systemd_knows(assignment: str, expected: tuple[str, str, Any]) -> None:
+    properties = parse_property(assignment, NEWER)
+    assert list(properties.values()) == [expected]
+    key, _, text = assignment.partition("=")
+    texts = {"NewSec": "5s", "StateDirectoryQuota": "5M"}
+    assert format_property(key, properties) == [f"{key}={texts.get(key, text)}"]
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message", "hint"),
+    [
+        ("Foo=5", "services have no such property", "directives"),
+        ("PrivateBPF=perhaps", "cannot set property PrivateBPF to 'perhaps'", "yes or no"),
+        ("Pairs=a:b", "cannot set property Pairs from here", "drop-in"),
+        ("Restart=on failure", "cannot set property Restart to 'on failure'", "on-failure"),
+        ("Nice=much", "cannot set property Nice to 'much'", "between -20 and 19"),
+        ("ExecStart=/bin/x", "needs it to supervise", "leave it out"),
+    ],
+)
+def test_what_a_newer_systemd_is_not_asked(assignment: str, message: str, hint: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_property(assignment, NEWER)
+    assert message in caught.value.message
+    assert hint in caught.value.hint
+
+
+def test_unknown_keys() -> None:
+    assert unknown_keys(["Nice=5", "PrivateBPF=yes", "Restart=never"]) == ["PrivateBPF", "Restart"]
 
 
 def test_resource_limits_are_two_properties() -> None:

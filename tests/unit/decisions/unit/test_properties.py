@@ -54,7 +54,6 @@ RestartForceExitStatus=SIGABRT
 Restart=no
 Delegate=yes
 DelegateSubgroup=supervisor
-CPUAccounting=yes
 MemoryAccounting=yes
 TasksAccounting=yes
 IOAccounting=yes

@@ -103,11 +103,38 @@ def test_warnings_about_limits() -> None:
 
 
 def test_plan_as_text() -> None:
-    text = format_plan(make_plan())
+    text = format_plan(make_plan(), FakeManager)
     assert text.startswith(f"# {UNIT}\n# source: /srv/robot.yml\n[Unit]\n")
     assert "Environment=PATH=/bin\n" in text
     assert "[Install]" not in text
-    assert format_plan(make_plan(), "dora.target").endswith("\n[Install]\nWantedBy=dora.target\n")
+    at_boot = format_plan(make_plan(), FakeManager, "dora.target")
+    assert at_boot.endswith("\n[Install]\nWantedBy=dora.target\n")
+
+
+NEW = ("FileDescriptorStorePreserve=on-success", "PrivateBPF=yes")
+
+
+def test_what_only_a_newer_systemd_knows_is_passed_on_with_a_note() -> None:
+    plan = make_plan(property=NEW)
+    manager = FakeManager()
+    manager.systemd, manager.types = "262-1", {"PrivateBPF": "b"}
+    properties, warnings = plan_properties(plan, manager)
+    assert properties["FileDescriptorStorePreserve"].value == "on-success"
+    assert properties["PrivateBPF"] == ("PrivateBPF", "b", True)
+    assert warnings == tuple(
+        f"{key}= is passed on as it is: doractl does not know this, systemd 262 judges it"
+        for key in ("FileDescriptorStorePreserve", "PrivateBPF")
+    )
+    text = format_plan(plan, lambda: manager)
+    assert f"{NEW[0]}\n" in text
+    assert f"{NEW[1]}\n" in text
+
+
+@pytest.mark.parametrize("assignment", NEW)
+def test_what_this_systemd_lacks_too_is_refused(assignment: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        plan_properties(make_plan(property=(assignment,)), FakeManager())
+    assert caught.value.code is ExitCode.USAGE
 
 
 def test_fake_and_real_manager_have_the_same_methods() -> None:
