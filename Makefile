@@ -93,9 +93,17 @@ bench-quick:  ## a few benchmarks in 3 minutes, their ratios beside the stored o
 	@$(PREPARE) container
 	@LAB=rivals tests/lab/lab run -- python -m benchmarks.quick $(WHAT)
 
-bookworm:  ## the packages on Debian 12, with systemd 252, installed by apt
+bookworm:  ## the packages on Debian 12, with systemd 252, installed by apt, and wheels by uv
 	@$(PREPARE) container
 	@$(CHECK) bookworm
+
+forky:  ## the same on the next Debian, with systemd 262
+	@$(PREPARE) container
+	@$(CHECK) forky
+
+canary:  ## what differs with the newest dora on PyPI, or with VERSION=
+	@$(PREPARE) container
+	@VERSION=$(VERSION) $(CHECK) canary
 
 lint:  ## ruff and mypy
 	@$(PREPARE)
@@ -120,4 +128,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm emulator faults history power fuzz mutants browser machines bench bench-quick bookworm lint demo clean deb wheels autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm emulator faults history power fuzz mutants browser machines bench bench-quick bookworm forky canary lint demo clean deb wheels autopkgtest

@@ -24,6 +24,8 @@ VARIATIONS = (
     {"TZ": "Pacific/Kiritimati", "LANG": "C", "DEB_BUILD_OPTIONS": "parallel=1"},
 )
 UMASKS = ("0022", "0002")
+# Beside this: what makes no packages.
+NO_PACKAGES = ("wheels.py", "autopkgtest.py", "autopkgtest.sh")
 LINTIAN = ("lintian", "--allow-root", "--fail-on=error,warning", "--tag-display-limit=0")
 
 
@@ -73,6 +75,7 @@ def dora_key(source: Source, room: Path, is_once: bool) -> str:
     """What the packages of dora's command are made of: it changes with dora's versions only."""
     debian, builder = source.debian.relative_to(CHECKOUT), HERE.relative_to(CHECKOUT)
     files = [path for path in list_checkout() if {debian, builder} & {*path.parents}]
+    files = [path for path in files if path.name not in NO_PACKAGES]
     parts = [(str(path), definition.read_part(CHECKOUT / path)) for path in files]
     return definition.digest(parts, room.name, is_once)
 

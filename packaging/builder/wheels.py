@@ -12,15 +12,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lab import definition
-from lab.bookworm import COMPILED
 from lab.cache import find_cache
 from lab.errors import LabError, Stage, say
+from lab.platforms import COMPILED
 from lab.process import need_root
 
 from builder.room import ensure_suite, network_environment, run_in_room
 from builder.sources import CHECKOUT, SOURCES, copy_files, list_checkout, read_date, settle
 
-SUITES = (definition.OLD_SUITE, definition.SUITE)
+SUITES = (definition.OLD_SUITE, definition.SUITE, definition.NEW_SUITE)
 PACKAGES = ("libsystemd-dev", "pkgconf", "python3-dev", "python3-pip", "python3-setuptools")
 OUT = CHECKOUT / "dist/wheels"
 
@@ -41,7 +41,8 @@ def main(suites: Sequence[str]) -> int:
 
 def build_wheels(cache: Path, place: Path, suite: str) -> Path:
     """The directory with the wheels for the Python of a release of Debian."""
-    room = ensure_suite(cache, "wheelroom", suite, PACKAGES)
+    # A kind for each, as the cache keeps two of a kind.
+    room = ensure_suite(cache, f"wheelroom.{suite}", suite, PACKAGES)
     build = place / suite
     source = build / "dora-systemd"
     source.mkdir(parents=True)

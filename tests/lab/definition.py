@@ -27,17 +27,23 @@ PYPI = [
     "pytest-timeout", "hypothesis",
 ]  # fmt: skip
 
-# The oldest Debian that the product works on, with what its package needs there, and no more.
-OLD_SUITE = "bookworm"
-OLD_PACKAGES = [
+# What the product's package needs, and no more.
+PLATFORM_PACKAGES = [
     "systemd", "systemd-sysv", "libpam-systemd", "dbus", "dbus-user-session", "polkitd",
     "ca-certificates", "iproute2", "openssh-client", "procps", "python3-click", "python3-pathspec",
     "python3-pydantic", "python3-pystemd", "python3-systemd", "python3-venv", "python3-websockets",
     "python3-yaml",
 ]  # fmt: skip
+# Programs that its tests run.
+TOOLS = [
+    "bash-completion", "curl", "fish", "git", "kmod", "less", "lsof", "man-db", "mandoc", "psmisc",
+    "rsync", "socat", "strace", "tmux", "udev", "zsh",
+]  # fmt: skip
 
-# The next one, which is not released yet.
-NEW_SUITE = "forky"
+# The oldest Debian that the product works on, and the next one, which is not released yet.
+OLD_SUITE, NEW_SUITE = "bookworm", "forky"
+# Those beside SUITE, and what only one of them has.
+PLATFORMS: dict[str, list[str]] = {OLD_SUITE: [], NEW_SUITE: ["python3-watchfiles"]}
 
 KERNEL = "linux-image-cloud-amd64"
 

@@ -2,18 +2,21 @@
 
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 
 from lab import cgroup
-from lab.bookworm import ensure_bookworm
 from lab.browser import ensure_browser
 from lab.cache import find_cache, remove_layer
 from lab.container import run_in_container
+from lab.definition import PLATFORMS
 from lab.errors import LabError
 from lab.image import ensure_tree
 from lab.machine import run_in_emulator, run_in_vm
 from lab.machines import run_in_machines
 from lab.options import Options, parse_options
+from lab.platforms import ensure_platform
 from lab.process import need_root
 from lab.rivals import ensure_rivals
 from lab.runs import Guard, clean_dead_runs, close_run, open_run, opened_door
@@ -78,23 +81,23 @@ def clean(options: Options) -> int:
     return 0
 
 
-ENSURE = {
+ENSURE: dict[str, Callable[[Path], Path]] = {
     "container": ensure_tree,
     "vm": ensure_user_kernel,
     "emulator": ensure_snapshot,
-    "bookworm": ensure_bookworm,
     "rivals": ensure_rivals,
     "browser": ensure_browser,
     "machines": ensure_tree,
+    **{suite: partial(ensure_platform, suite=suite) for suite in PLATFORMS},
 }
 RUN = {
     "container": run_in_container,
     "vm": run_in_vm,
     "emulator": run_in_emulator,
-    "bookworm": run_in_container,
     "rivals": run_in_container,
     "browser": run_in_container,
     "machines": run_in_machines,
+    **dict.fromkeys(PLATFORMS, run_in_container),
 }
 VERBS = {
     "run": run_command,

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lab.definition import PLATFORMS
 from lab.errors import LabError
 
-FORMS = ("container", "vm", "emulator", "bookworm", "rivals", "browser", "machines")
+FORMS = ("container", "vm", "emulator", *PLATFORMS, "rivals", "browser", "machines")
 
 MACHINES = ("vm", "emulator")
 
@@ -20,8 +21,9 @@ environment:
                     systemd accepts limits there but cannot enforce them
   LAB=vm            a machine with a kernel of its own, as a process, and cgroup v2 controllers
   LAB=emulator      an emulated machine with Debian's kernel: PSI, cpusets, two processors
-  LAB=bookworm      a container with Debian 12: systemd 252, Python 3.11, the checkout
-                    not installed, but all that pip needs to do so
+  LAB=bookworm      a container with Debian 12: systemd 252, Python 3.11; the checkout is not
+                    installed, but all that its packages need is
+  LAB=forky         the same with the next Debian: systemd 262, Python 3.14
   LAB=rivals        the container with supervisord, circus and pm2, for benchmarks
   LAB=browser       the container with Chromium, for the status page
   LAB=machines      three containers, a b c, on a network with sshd; the command runs in a

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from lab.cache import find_cache
 from lab.changed import changed_rooms
-from lab.definition import CHECKOUT
+from lab.definition import CHECKOUT, NEW_SUITE, OLD_SUITE, PLATFORMS
 from lab.errors import LabError
 from lab.options import MACHINES
 from lab.process import need_root
@@ -29,6 +29,8 @@ NO_KERNEL = "not vm and not emulator"
 # Containers at the same time. Most of the time of a test is waiting, and one more than three makes
 # two cores so busy that the tests wait for each other.
 CONTAINERS = 3
+# What `make test` runs on the next Debian: what differs there.
+NEW = "versions or doctor or units or life or enabled or newer or account or user"
 # A dataflow as a service, from start to stop: what to run after every change.
 QUICK = (
     *("cell", "start", "bus", "lab", "stop", "list", "kinds"),
@@ -57,9 +59,9 @@ def plan_test(form: str) -> list[Step]:
     queue = [replace(one, after=(unit.name,)) for one in plan_system("container")]
     inside, several = (replace(one, after=(unit.name,)) for one in (inside, several))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
-    oldest = plan_bookworm(form)[1:]
+    oldest, newest = platform_step(OLD_SUITE, minutes=2), platform_step(NEW_SUITE, "-k", NEW)
     others = [*plan_lab(form), *plan_other_python(form), *plan_emulator(form)]
-    lane = [build, packages_step(), *oldest, *others]
+    lane = [build, packages_step(), wheels_step(), oldest, newest, *others]
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
     return [unit, several, *in_a_row(lane, unit), inside, restarted, *queue]
 
@@ -153,11 +155,19 @@ def packages_step() -> Step:
     return lab_step("tests of the Debian packages", "container", ["tests/deb"], minutes=4)
 
 
-def plan_bookworm(_form: str) -> list[Step]:
-    """The oldest systemd that the product takes, where apt installs the packages, and uv wheels."""
-    built = [build_step(), Step("wheels", ["packaging/wheels"], os.environ.copy, minutes=2)]
-    step = lab_step("tests on Debian 12", "bookworm", ["tests/bookworm"], minutes=2)
+def plan_platform(_form: str, suite: str) -> list[Step]:
+    """Another release of Debian, where apt installs the packages, and uv wheels."""
+    built = [build_step(), wheels_step()]
+    step = platform_step(suite, minutes=2)
     return [*built, replace(step, after=tuple(one.name for one in built))]
+
+
+def wheels_step() -> Step:
+    return Step("wheels", ["packaging/wheels"], os.environ.copy, minutes=2)
+
+
+def platform_step(suite: str, *options: str, minutes: int = 1) -> Step:
+    return lab_step(f"tests on Debian {suite}", suite, ["tests/platforms", *options], minutes)
 
 
 def plan_system(form: str) -> list[Step]:
@@ -192,9 +202,10 @@ def plan_faults(form: str) -> list[Step]:
     """Every fault as often as ROUNDS says; a machine of its own, and nothing beside it."""
     rounds = os.environ.get("ROUNDS") or "1"
     marks = "vm" if form in MACHINES else NO_KERNEL
-    command = ["tests/lab/lab", "run", "--env", f"FAULT_ROUNDS={rounds}", "--", "pytest"]
-    command += [FAULTS, "-m", marks]
-    return [Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))]
+    command = ["tests/lab/lab", "run", "--env", f"FAULT_ROUNDS={rounds}", "--", *installed(form)]
+    command += ["pytest", FAULTS, "-m", marks]
+    step = Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))
+    return [*packages_for(form), step]
 
 
 def plan_history(form: str) -> list[Step]:
@@ -218,6 +229,12 @@ def plan_power(_form: str) -> list[Step]:
     return [Step("power cuts, vm", command, in_lab("vm"), minutes=2 * int(words[0]))]
 
 
+def plan_canary(_form: str) -> list[Step]:
+    """What changes with another dora: the newest on PyPI, or VERSION."""
+    version = [name for name in (os.environ.get("VERSION"),) if name]
+    return [Step("canary", ["python", "-m", "tests.canary", *version], in_venv, minutes=6)]
+
+
 def plan_fuzz(_form: str) -> list[Step]:
     seconds = os.environ.get("FUZZ_SECONDS") or "120"
     return [Step("fuzzing", ["python", "-m", "tests.fuzz", seconds], in_venv)]
@@ -237,10 +254,23 @@ def in_venv_with_mutmut() -> dict[str, str]:
     return venv_environment(venv)
 
 
-def plan_quick(_form: str) -> list[Step]:
-    """The heart of the system tests."""
+def plan_quick(form: str) -> list[Step]:
+    """The heart of the system tests; on another Debian, with the packages."""
     files = [f"tests/system/test_{name}.py" for name in QUICK]
-    return queue_steps("quick system tests", "container", [*files, "-m", NO_KERNEL])
+    where = form if form in PLATFORMS else "container"
+    steps = queue_steps("quick system tests", where, [*files, "-m", NO_KERNEL])
+    return [*packages_for(form), *steps]
+
+
+def packages_for(form: str) -> list[Step]:
+    """On another Debian the packages are tested, not the checkout."""
+    command = ["packaging/build", "--once"]
+    return [Step("Debian packages", command, os.environ.copy, minutes=2)][: form in PLATFORMS]
+
+
+def installed(form: str) -> list[str]:
+    """The words before a command that uses what is tested."""
+    return ["tests/platforms/installed"] if form in PLATFORMS else []
 
 
 def queue_steps(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> list[Step]:
@@ -250,13 +280,14 @@ def queue_steps(name: str, form: str, arguments: Sequence[str], minutes: int = 0
     atexit.register(shutil.rmtree, queue, ignore_errors=True)
     place = f"/out/{queue.name}" if given else "/out"
     env = {**os.environ, "LAB": form, "LAB_OUT": given or str(queue)}
+    run = ["tests/lab/lab", "run", "--", *installed(form)]
     return [
         Step(
             f"{name}, container {number} of {CONTAINERS}",
-            ["tests/lab/lab", "run", "--", "pytest", f"--queue={place}", *arguments],
+            [*run, "pytest", f"--queue={place}", *arguments],
             env.copy,
             minutes=minutes,
-            after=(),
+            after=tuple(one.name for one in packages_for(form)),
         )
         for number in range(1, CONTAINERS + 1)
     ]
@@ -286,6 +317,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "faults": plan_faults,
     "history": plan_history,
     "power": plan_power,
+    "canary": plan_canary,
     "fuzz": plan_fuzz,
     "mutants": plan_mutants,
     "other-python": plan_other_python,
@@ -293,7 +325,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "vm": plan_vm,
     "emulator": plan_emulator,
     "packages": plan_packages,
-    "bookworm": plan_bookworm,
+    **{suite: partial(plan_platform, suite=suite) for suite in PLATFORMS},
     "browser": plan_browser,
     "machines": plan_machines,
     "lint": plan_lint,

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.canary import help_tree
 from tests.system.cells import Cell, Project, run
 
 PROBE = """
@@ -143,3 +144,8 @@ def test_variables_of_root_are_for_files_of_root(flow: Path, cell: Cell, owner: 
     else:
         assert "names a variable that is not set" in done.stderr
         assert "secret" not in done.stdout + done.stderr
+
+
+def test_dora_has_the_commands_and_options_of_the_stored_tree() -> None:
+    """`make canary` shows what another dora has; the tree is of the one that the tests run with."""
+    assert help_tree.differences("dora") == []

@@ -1,4 +1,4 @@
-"""What dora and zenoh say, now and then, of nothing but the speed of the machine.
+"""What dora, zenoh and systemd say, now and then, of nothing but the lab's machine and its speed.
 
 No test asks for these lines and no test fails because of one. Every other warning in the journal of
 our units fails the test that it comes up in, unless that test announces it.
@@ -25,6 +25,7 @@ class Word(NamedTuple):
 
 _ORDER = "a node opens zenoh before its peers do, or outlives them by milliseconds"
 _SLOW = "a node or the daemon got no processor for a while"
+_NO_CONTROLLERS = "systemd 262 reads a limit of groups that have none in the lab's container"
 _ENDING = "one end of a connection within the cell was closed a moment before the other"
 
 TOLERATED = (
@@ -84,6 +85,7 @@ TOLERATED = (
         "Unable to create POSIX shm segment",
         "the lab's root may not raise limits, and nodes lock 8 MiB of shared memory or more",
     ),
+    Word("Failed to read pids.max for control group", _NO_CONTROLLERS),
 )
 
 

@@ -10,7 +10,7 @@ from subprocess import CompletedProcess
 
 import pytest
 
-from tests.bookworm import test_bookworm
+from tests.platforms import test_packages
 from tests.system.cells import Project, run, wait_for, wait_no_process
 
 CHECKOUT = Path(__file__).parents[2]
@@ -24,7 +24,7 @@ def as_user(line: str, check: bool = True) -> CompletedProcess[str]:
     """Run a line in a shell of USER, which finds uv and what uv has installed."""
     path = f"{HOME}/.local/bin:/opt/lab/bin:/usr/bin:/bin"
     shell = ("sh", "-c", f"PATH={path}; cd {CHECKOUT}; {line}")
-    return test_bookworm.as_user(USER, *shell, check=check)
+    return test_packages.as_user(USER, *shell, check=check)
 
 
 @pytest.fixture(scope="module")
