@@ -97,6 +97,9 @@ class Manager(Protocol):
     def reset_failed(self, unit: str) -> None:
         """Clear the failed state of a unit; systemd then unloads a transient one."""
 
+    def close_stored(self, unit: str) -> None:
+        """Close the descriptors that systemd keeps of an ended unit."""
+
     def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
         """Change properties of a loaded unit; runtime: only until the next boot."""
 

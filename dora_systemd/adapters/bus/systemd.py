@@ -134,6 +134,9 @@ class Bus:
     def reset_failed(self, unit: str) -> None:
         self._call(f"reset {unit}", "ResetFailedUnit", ("s", unit))
 
+    def close_stored(self, unit: str) -> None:
+        self._call(f"clean {unit}", "CleanUnit", ("s", unit), ("as", ["fdstore"]))
+
     def hold(self, unit: str) -> None:
         self._call(f"hold {unit}", "RefUnit", ("s", unit))
 

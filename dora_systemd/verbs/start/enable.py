@@ -41,6 +41,7 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import own_directories, wanted_units
 
 _FORGET_SECONDS = 2.0
+_HELD = ("Transient", "NFileDescriptorStore")
 _RETRY_SECONDS = 0.02
 
 
@@ -278,9 +279,14 @@ def release_transient(manager: Manager, boot: BootUnit) -> None:
 
 
 def wait_until_forgotten(manager: Manager, unit: str) -> None:
-    """Wait until a transient unit is gone: systemd unloads it a moment after the last reference."""
+    """Wait until a transient unit is gone: systemd unloads it a moment after the last reference.
+
+    What FileDescriptorStorePreserve= keeps of it would keep the unit as well.
+    """
     deadline = time.monotonic() + _FORGET_SECONDS
-    while manager.read(unit, ["Transient"])["Transient"]:
+    while (facts := manager.read(unit, _HELD))["Transient"]:
+        if facts["NFileDescriptorStore"]:
+            manager.close_stored(unit)
         if time.monotonic() > deadline:
             raise DoraSystemdError(
                 f"cannot start {unit}: systemd still holds the ended one",

@@ -61,10 +61,7 @@ def passed_on(plan: Plan, systemd_version: int) -> Iterator[str]:
     """A note for each property that only systemd can judge."""
     assignments = plan.settings[PROPERTY]
     for key in unknown_keys(assignments):
-        yield (
-            f"{key}= is passed on as it is: doractl does not know this, "
-            f"systemd {systemd_version} judges it"
-        )
+        yield f"{key}= is passed on as it is: only systemd {systemd_version} can judge it"
 
 
 def _newer(plan: Plan, manager: Callable[[], Manager]) -> Newer:

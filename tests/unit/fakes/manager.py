@@ -156,6 +156,10 @@ class FakeManager:
         if unit not in self.held and self.units[unit]["ActiveState"] != "active":
             del self.units[unit]
 
+    def close_stored(self, unit: str) -> None:
+        self.calls.append(("close", unit))
+        self.units[unit].update(Transient=False, NFileDescriptorStore=0)
+
     def hold(self, unit: str) -> None:
         self.held.add(unit)
 

@@ -22,6 +22,7 @@ from dora_systemd.verbs.start.enable import (
     enable_cell,
     install_unit_file,
     read_boot_unit,
+    wait_until_forgotten,
 )
 from dora_systemd.verbs.start.logins import ensure_linger, linger_note
 from dora_systemd.verbs.stop import stop_cells
@@ -204,6 +205,13 @@ def test_after_its_end_the_file_counts(
     link = ("enable", str(path_of(manager)))
     stop = ("StopUnit", UNIT)
     assert manager.calls == [stop, ("disable", UNIT), ("reload",), link, ("reload",)]
+
+
+def test_what_descriptors_hold_is_let_go(manager: FakeManager) -> None:
+    """As with FileDescriptorStorePreserve=, when a unit has ended."""
+    unit = manager.add(options(), active="inactive", NFileDescriptorStore=6)
+    wait_until_forgotten(manager, unit)
+    assert ("close", unit) in manager.calls
 
 
 def test_the_target(manager: FakeManager, scope: Scope) -> None:

@@ -122,7 +122,7 @@ def test_what_only_a_newer_systemd_knows_is_passed_on_with_a_note() -> None:
     assert properties["FileDescriptorStorePreserve"].value == "on-success"
     assert properties["PrivateBPF"] == ("PrivateBPF", "b", True)
     assert warnings == tuple(
-        f"{key}= is passed on as it is: doractl does not know this, systemd 262 judges it"
+        f"{key}= is passed on as it is: only systemd 262 can judge it"
         for key in ("FileDescriptorStorePreserve", "PrivateBPF")
     )
     text = format_plan(plan, lambda: manager)
