@@ -70,11 +70,11 @@ def make_plan(scope: Scope, request: StartRequest, read: Files | None = None) ->
     user = choose_user(scope, settings[USER], files.place, directory)
     with sight_of(account_of(user)) as sight:
         dataflow = files.dataflow()  # the process that looks for another user boots meanwhile
-        look = Look(sight, settings, user)
-        where = find_where(scope, request, files, settings, dataflow, look)
+        look = Look(sight, settings, user, directory)
+        where = find_where(scope, request, files, dataflow, look)
         check_credentials(scope, credential_files(settings))
         launch, missing = check_startable(where, sight, dataflow, request.is_unbuilt)
-        sandbox = make_sandbox(scope, settings, user, Prepared(dataflow, launch, {}), sight)
         notes = tuple(plan_notes(scope, settings, dataflow, launch, sight))
+        sandbox = make_sandbox(scope, settings, user, Prepared(dataflow, launch, {}), sight)
     facts = (scope, where.options, settings, user, where.environment)
     return Plan(*facts, sandbox, notes, where.members, missing)

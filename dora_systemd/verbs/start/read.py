@@ -36,6 +36,7 @@ class SettingsFile:
 class Files:
     """The dataflow file and its settings files, as they were read."""
 
+    name: str  # of the dataflow
     path: Path  # absolute, of the dataflow file
     text: Text
     place: Place  # of the file whose owner decides: the dataflow file, or the origin of a release
@@ -50,13 +51,12 @@ class Files:
 
 def read_files(request: StartRequest) -> Files:
     """Read what a request names. Raises DoraSystemdError."""
-    path, origin = path_of(request), request.origin
-    request_name(request)
+    path, origin, name = path_of(request), request.origin, request_name(request)
     text = _read(path)
     if origin is None:
         _refuse_release(path)
     beside = read_beside(path, origin)
-    return Files(path, text, origin or text.place, beside, read_general(request.environment))
+    return Files(name, path, text, origin or text.place, beside, read_general(request.environment))
 
 
 def _read(path: Path) -> Text:

@@ -32,7 +32,7 @@ from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.trust.sight import Sight, cannot_reach
 from dora_systemd.values import quoted, shown
 from dora_systemd.verbs.start.read import Files
-from dora_systemd.verbs.start.request import StartRequest, request_name
+from dora_systemd.verbs.start.request import StartRequest
 
 if TYPE_CHECKING:  # most dataflows run on one machine
     from dora_systemd.decisions.machines.member import Member
@@ -50,6 +50,7 @@ class Look:
     sight: Sight
     settings: Settings
     user: pwd.struct_passwd | None  # None: the caller, as itself
+    directory: str  # absolute, where relative paths begin
 
     def find_venv(self, dataflow: str, environment: Mapping[str, str]) -> str | None:
         """--venv, else the caller's VIRTUAL_ENV, else .venv beside the dataflow, else None."""
@@ -72,11 +73,11 @@ class Look:
     def _is_venv(self, venv: str) -> bool:
         return self.sight.exists(f"{venv}/bin/python")
 
-    def check_reach(self, dataflow: str, directory: str) -> None:
+    def check_reach(self, dataflow: str) -> None:
         """Raise DoraSystemdError for a working directory, or files, that the user cannot access."""
-        if not self.sight.is_directory(directory):
-            self._blame(WORKING_DIRECTORY, directory, _OWN.is_directory(directory))
-            raise no_directory(directory)
+        if not self.sight.is_directory(self.directory):
+            self._blame(WORKING_DIRECTORY, self.directory, _OWN.is_directory(self.directory))
+            raise no_directory(self.directory)
         for path in (dataflow, __file__):
             if self.user is not None and not self.sight.exists(path):
                 raise cannot_reach(self.user.pw_name, path)
@@ -111,24 +112,19 @@ class Where:
 
 
 def find_where(
-    scope: Scope,
-    request: StartRequest,
-    files: Files,
-    settings: Settings,
-    dataflow: Dataflow,
-    look: Look,
+    scope: Scope, request: StartRequest, files: Files, dataflow: Dataflow, look: Look
 ) -> Where:
     """Find programs and machines. Raises DoraSystemdError."""
-    path, directory = dataflow.source, working_directory(files, settings)
+    path, settings = dataflow.source, look.settings
     search_path = request.environment.get("PATH") or os.defpath
     venv = look.find_venv(path, request.environment)
     variables = _variables(settings, look.sight)
-    look.check_reach(path, directory)
+    look.check_reach(path)
     options = RunnerOptions(
-        name=request_name(request),
+        name=files.name,
         uuid=request.uuid or str(uuid.uuid4()),
         dataflow=path,
-        working_directory=directory,
+        working_directory=look.directory,
         dora=look.find_dora(venv, search_path),
         venv=venv,
         attached=request.attached,
