@@ -11,5 +11,6 @@
     start        whose name is free            Claim
     start_unit   the unit that has started     Started
 
-No stage calls an earlier one. `plan.make_plan` is the first seven of them, `start.claim` the rest.
+A stage takes the values of those above it, and runs none of them again. `plan.make_plan` is the
+first seven; `start.claim` is all but the last.
 """
