@@ -33,11 +33,12 @@ HEAD, MEMBER = "a", "b"
 SENDER = """
 import time
 from dora import Node
-import numpy, pyarrow
+import os, pyarrow
 node = Node()
 time.sleep(3)
 def send(what, size, count, pause):
-    data = pyarrow.array(numpy.random.default_rng(0).integers(255, size=size, dtype="uint8"))
+    buffers = [None, pyarrow.py_buffer(os.urandom(size))]
+    data = pyarrow.Array.from_buffers(pyarrow.uint8(), size, buffers)
     due = time.monotonic()
     for number in range(count):
         node.send_output("data", data, {"what": what, "sent": time.monotonic_ns()})

@@ -19,14 +19,15 @@ RESULT = STAMPS / "messages.json"
 SENDER = f"""
 import time
 from dora import Node
-import numpy, pyarrow
+import os, pyarrow
 node = Node()
 time.sleep(2)
 for number in range({COUNT}):
     node.send_output("data", pyarrow.array([1] * 3), {{"is_fast": 0, "sent": 0}})
     time.sleep(0.01)
 for size in {SIZES}:
-    data = pyarrow.array(numpy.random.default_rng(0).integers(255, size=size, dtype="uint8"))
+    buffers = [None, pyarrow.py_buffer(os.urandom(size))]
+    data = pyarrow.Array.from_buffers(pyarrow.uint8(), size, buffers)
     for pause in (0.01, 0):
         for number in range({COUNT}):
             about = {{"is_fast": int(not pause), "sent": time.monotonic_ns()}}

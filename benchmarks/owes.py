@@ -20,8 +20,9 @@ SECONDS = 10.0
 SENDER = """
 import time
 from dora import Node
-import numpy, pyarrow
-node, data = Node(), pyarrow.array(numpy.zeros(1_000_000, dtype="uint8"))
+import pyarrow
+buffers = [None, pyarrow.py_buffer(bytes(1_000_000))]
+node, data = Node(), pyarrow.Array.from_buffers(pyarrow.uint8(), 1_000_000, buffers)
 for event in node:
     if event["type"] == "INPUT":
         node.send_output("image", data, {"sent": time.monotonic_ns()})

@@ -19,7 +19,7 @@ PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 AUTOPKGTEST = "AUTOPKGTEST_TMP" in os.environ
 """There the packages come from a repository, and so are installed already."""
 ROBOT = CHECKOUT / "examples/robot"
-_LAB_MODULES = "opt/lab/lib/python3*/site-packages"
+_LAB_MODULES = ("opt/lab/lib/python3*/site-packages", "opt/numpy")
 _LIBRARIES = ("dora-rs==1.1.0", "pyarrow", "numpy")
 
 _WATCHED = ("/etc", "/usr", "/var", "/opt", "/run/dora-systemd")
@@ -105,7 +105,7 @@ def robot(user: str) -> Iterator[Path]:
 
 def make_venv(venv: Path) -> None:
     """With what the nodes need: that of the lab, elsewhere from PyPI."""
-    modules = [str(path) for path in Path("/").glob(_LAB_MODULES)]
+    modules = [str(path) for place in _LAB_MODULES for path in Path("/").glob(place)]
     run("python3", "-m", "venv", *(["--without-pip"] if modules else []), str(venv))
     if modules:
         (library,) = venv.glob("lib/python3*/site-packages")

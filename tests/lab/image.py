@@ -48,6 +48,8 @@ def build_base(path: Path, log: Path) -> None:
     with Stage("dora and test tools from PyPI"):
         run_in_tree(path, ["python3", "-m", "venv", "--system-site-packages", "/opt/lab"], log)
         run_in_tree(path, ["pip", "install", "--no-cache-dir", *definition.PYPI], log)
+        apart = ["--no-deps", f"--target={definition.NUMPY}"]
+        run_in_tree(path, ["pip", "install", "--no-cache-dir", *apart, "numpy"], log)
     with Stage("users and units"):
         shutil.copy(definition.HERE / "setup.sh", path / "run/setup.sh")
         run_in_tree(path, ["sh", "/run/setup.sh"], log)

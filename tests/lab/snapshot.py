@@ -27,7 +27,7 @@ SOURCES = ("snapshot.py", "qemu.py", "emulator.py", "initrd.py")
 
 # Once before the snapshot, so that no run pays for reading them from disk.
 WARM_UP = (
-    "import dora, pyarrow, numpy, pydantic, click, yaml, websockets, watchfiles, pytest;"
+    "import dora, pyarrow, pydantic, click, yaml, websockets, watchfiles, pytest;"
     "import pystemd, systemd.journal, hypothesis"
 )
 

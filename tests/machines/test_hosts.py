@@ -14,12 +14,13 @@ from tests.machines.wires import OTHERS, cable, clear, power_cut, there
 from tests.system.cells import run, wait_for
 
 ROBOT = "/src/examples/robot/dataflow.yml"
+NUMPY = "--env=PYTHONPATH=/opt/numpy"
 
 
 @pytest.fixture(autouse=True)
 def dataflows() -> Iterator[None]:
     """The same dataflow on both of the others, enabled on b."""
-    started = doractl("start", ROBOT, "--name", "robot", "-H", "b,c")
+    started = doractl("start", ROBOT, "--name", "robot", NUMPY, "-H", "b,c")
     assert started.returncode == 0, started.stderr
     assert doractl("enable", "robot", "-H", "b").returncode == 0
     yield
