@@ -171,8 +171,6 @@ def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
 def _meant_verb(name: str) -> str:
     from difflib import get_close_matches
 
-    if name == "build":
-        return "dora build FILE builds the nodes, doractl deploy builds a release"
     known = WORDS_OF_OTHERS.get(name)
     meant = known or next(iter(get_close_matches(name, [*SHOWN, *ALIASES], n=1)), "")
     return f"did you mean doractl {meant}?" if meant else "doractl --help lists all commands"

@@ -89,15 +89,16 @@ class SettingsCommand(click.Command):
 
 def setting_options(function: F) -> F:
     """All flags of settings. Their raw values become keyword arguments with the setting's name."""
-    return _options(SETTINGS, function)
+    return options_of(SETTINGS, function)
 
 
 def live_options(function: F) -> F:
     """The flags of settings that can be changed while a dataflow is running."""
-    return _options(CHANGEABLE, function)
+    return options_of(CHANGEABLE, function)
 
 
-def _options(settings: Sequence[Setting[Any]], function: F) -> F:
+def options_of(settings: Sequence[Setting[Any]], function: F) -> F:
+    """The flags of these settings; see setting_options()."""
     for setting in reversed(settings):
         if setting.flags:
             function = _option(setting)(function)

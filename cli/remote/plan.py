@@ -21,6 +21,8 @@ _ONE_HOST = {
 """Verbs that belong to one terminal."""
 ROLLOUTS = ("deploy", "rollback")
 """Verbs that some hosts get after others, and no more once a release has failed its trial."""
+_LONG = ("build", "run", "dora", *ROLLOUTS)
+"""Verbs that must not go on over there when this command has ended."""
 _FILES = (".yml", ".yaml", ".json")
 _FOLLOWING = ("is_follow", "until_end", "want_logs")
 """Options by which a verb goes on until somebody ends it."""
@@ -79,7 +81,7 @@ def plan_of(context: click.Context, words: list[str]) -> Plan:
     verb = _verb(context)
     options = dict(context.params)
     wants_json = _value(context, "output") == "json"
-    endless = any(options.get(name) for name in _FOLLOWING) or verb in ("run", "dora", *ROLLOUTS)
+    endless = any(options.get(name) for name in _FOLLOWING) or verb in _LONG
     endless |= verb == "top" and wants_json and not options.get("is_once")
     holds = verb == "inhibit" and options.get("selector") is not None
     # What waits or holds a lock over there must not go on when this command has ended.

@@ -19,7 +19,7 @@ RECOMMENDED_DORA = (1, 1)
 DORA_SECONDS = 60.0
 
 _PRINT_VERSION = "import sys; print('%d.%d.%d' % sys.version_info[:3])"
-_INSTALL_HINT = "pip install dora-rs-cli, install the package dora-cli, or give --dora PATH"
+INSTALL_HINT = "pip install dora-rs-cli, install the package dora-cli, or give --dora PATH"
 
 
 def run_dora(
@@ -58,7 +58,7 @@ def find_dora(
     found = _which("dora" if given is None else given, places, sight or Sight())
     if found is None:
         what = "find the dora command" if given is None else f"run the dora command {given}"
-        raise DoraSystemdError(f"cannot {what}", _INSTALL_HINT, ExitCode.NO_DORA)
+        raise DoraSystemdError(f"cannot {what}", INSTALL_HINT, ExitCode.NO_DORA)
     return found
 
 
@@ -80,7 +80,7 @@ def dora_version(
         words = " ".join((done.stderr or done.stdout).split())[:200]
         raise DoraSystemdError(
             f"cannot use {dora} as dora command: {words or 'it tells no version'}",
-            _INSTALL_HINT,
+            INSTALL_HINT,
             ExitCode.NO_DORA,
         )
     if version_numbers(version) < OLDEST_DORA:

@@ -30,6 +30,23 @@ def read_processes(proc: Path = PROC) -> list[Process]:
     return sorted((one for one in found if one), key=lambda one: one.pid)
 
 
+def session_members(session: int, proc: Path = PROC) -> list[int]:
+    """The processes of a session, see setsid(2)."""
+    return [int(path.name) for path in proc.glob("[0-9]*") if _session(path) == session]
+
+
+def _session(path: Path) -> int | None:
+    try:
+        return int(_status_fields(path)[3])
+    except (OSError, IndexError, ValueError):
+        return None
+
+
+def _status_fields(path: Path) -> list[str]:
+    """The fields of /proc/PID/stat after the name, which may contain blanks and parentheses."""
+    return (path / "stat").read_text(errors="replace").rpartition(")")[2].split()
+
+
 def socket_owners(inodes: Collection[int], proc: Path = PROC) -> frozenset[int]:
     """The processes that hold one of these sockets."""
     paths = proc.glob("[0-9]*/fd")
@@ -39,8 +56,7 @@ def socket_owners(inodes: Collection[int], proc: Path = PROC) -> frozenset[int]:
 def _read_process(path: Path) -> Process | None:
     try:
         command = beginning(path / "cmdline").decode(errors="replace").split("\0")[:-1]
-        # The name may contain blanks and parentheses; the fields after it do not.
-        parent = int((path / "stat").read_text(errors="replace").rpartition(")")[2].split()[1])
+        parent = int(_status_fields(path)[1])
         group = group_in(beginning(path / "cgroup"))
     except (OSError, IndexError, ValueError):
         return None

@@ -234,13 +234,13 @@ def _hint(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
     places = dict.fromkeys((directory, plan.options.working_directory))
     locked = next((one for one in places if plan.exists(f"{one}/uv.lock")), None)
     if locked and "/" not in node.path:  # a console script of a package
-        return f"run `uv sync` in {locked} first, or correct the path of the node"
+        return f"{_build_hint(source, plan)}, or correct the path of the node"
     return "correct the path of the node"
 
 
 def _build_hint(source: str, plan: LaunchPlan) -> str:
     uv = "--uv " if plan.options.uv else ""
-    return f"run `dora build {uv}{shown(source)}` first"
+    return f"run `doractl build {uv}{shown(source)}` first"
 
 
 def _uv_places(directory: str, plan: LaunchPlan) -> list[str]:

@@ -1,8 +1,8 @@
-"""The build of a release: whether there is one, its commands, and what it prints. Pure."""
+"""The build of a release or a project: its commands, and what it prints. Pure."""
 
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import PurePath
 
@@ -16,22 +16,27 @@ _LONGEST = 300
 """Maximum characters of a line of the build in an error or on a terminal."""
 _OF_NODE = re.compile(r"(?P<node>[\w.-]+): +(?P<level>stdout|stderr|[A-Z]+) +(?P<text>\S.*)")
 """A line that dora prints: "a: stdout   text", or "a: INFO     running build command"."""
+_FAILED_NODE = re.compile(r"failed to build node `(?P<node>[^`\n]+)`")
 _UV_ERROR = re.compile(r"^(?:error: | +× )", re.MULTILINE)
 _UV_CAUSE = re.compile(r"\n +(?:cause:|Caused by:|[├╰]─▶) *")
+_UNATTENDED = {"PIP_NO_INPUT": "1", "GIT_TERMINAL_PROMPT": "0"}
+"""Nobody is there to answer."""
+_HOMELESS = {
+    "UV_NO_CACHE": "1",
+    "UV_PYTHON_DOWNLOADS": "never",
+    "UV_PYTHON_PREFERENCE": "only-system",
+}
+"""uv keeps its cache and its Pythons in the home directory."""
 _ALWAYS = {
     # Bytecode is valid by its source's content, for the files get new times. Python, pip and uv
     # have this mode by this variable alone.
     "SOURCE_DATE_EPOCH": "315532800",
     # _COMPILE does that when all is there.
     "UV_COMPILE_BYTECODE": "0",
-    # The sandbox makes homes read-only, and a Python in one of them is no part of the release.
-    "UV_NO_CACHE": "1",
     "UV_LINK_MODE": "copy",
-    "UV_PYTHON_DOWNLOADS": "never",
-    "UV_PYTHON_PREFERENCE": "only-system",
-    # Nobody is there to answer.
-    "PIP_NO_INPUT": "1",
-    "GIT_TERMINAL_PROMPT": "0",
+    # The sandbox makes homes read-only, and a Python in one of them is no part of the release.
+    **_HOMELESS,
+    **_UNATTENDED,
 }
 _COMPILE = (
     '[ ! -x "$1/bin/python" ] || "$1/bin/python" -I -m compileall -qq -f -s "$2" '
@@ -46,12 +51,13 @@ share, for the path of the release is not in them. Packages have files that no P
 class BuildTask:
     """What the program of the build's unit is told."""
 
-    # name, uuid: of the dataflow
+    # name, uuid: of the dataflow; of a build of a project its file, and ""
     name: str
     uuid: str
     release: str  # its id
     directory: str  # where the commands run, in their order
     commands: tuple[tuple[str, ...], ...]
+    is_shown: bool = False  # whether somebody reads its standard output, and not the journal
 
 
 def format_task(task: BuildTask) -> str:
@@ -129,6 +135,34 @@ def build_commands(
     return tuple(found)
 
 
+def project_commands(
+    dataflow: str, lock: str, uv: str, dora: str, with_uv: bool
+) -> tuple[tuple[str, ...], ...]:
+    """The commands that build a project where it is.
+
+    lock: the directory of its uv.lock, or "". uv, dora: these commands. with_uv: of dora build.
+    """
+    sync = [(uv, "sync", "--directory", lock)] if lock else []
+    return (*sync, (dora, "build", "--local", *(("--uv",) if with_uv else ()), dataflow))
+
+
+def project_environment(
+    given: Mapping[str, str], venv: str | None, more: Sequence[str], has_home: bool
+) -> dict[str, str]:
+    """The variables of a build where the project is, from those of the nodes.
+
+    venv: that of the project, which uv may make, or None. more: directories for the end of PATH.
+    has_home: whether the account has a home directory that it can write, for caches.
+    """
+    always = {**_UNATTENDED, **({} if has_home else _HOMELESS)}
+    path = given.get("PATH", "")
+    own = {}
+    if venv is not None:
+        path = f"{venv}/bin:" + path.removeprefix(f"{venv}/bin:")
+        own = {"VIRTUAL_ENV": venv, "UV_PROJECT_ENVIRONMENT": venv}
+    return {**always, **given, **own, "PATH": ":".join([path, *more])}
+
+
 def build_environment(
     given: Mapping[str, str], venv: str | None, former_venv: str | None, more: str = ""
 ) -> dict[str, str]:
@@ -156,6 +190,12 @@ def is_output(line: str) -> bool:
     """Whether a build command has printed the line, and not dora itself."""
     found = _OF_NODE.fullmatch(without_sequences(line).strip())
     return found is not None and not found["level"].isupper()
+
+
+def parse_build_error(reason: str, printed: str) -> str:
+    """Name the node in a reason that dora gives. printed: the whole output of dora build."""
+    found = _FAILED_NODE.search(without_sequences(printed))
+    return f"node {found['node']}: {reason}" if found and reason else reason
 
 
 def parse_uv_error(printed: str) -> str:

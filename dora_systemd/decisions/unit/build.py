@@ -1,5 +1,6 @@
-"""The transient unit that builds a release: that of the dataflow, as far as a build needs it.
+"""The transient units of builds.
 
+That of a release is the unit of the dataflow, as far as a build needs it.
 Same user, same sandbox, same network. What is different: it may write the tree that it builds, and
 sees no other release; it has no credentials, no rights of single nodes, and few CPU shares beside
 what runs.
@@ -13,7 +14,7 @@ from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.structs import MS_REC
 from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.decisions.releases.entries import MOST_BYTES
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 
 _OF_NODES = (
     *(
@@ -71,6 +72,27 @@ def build_properties(
     )
     # A user's manager has no mounts without a user namespace, see systemd.exec(5).
     return with_assignments(kept, ["PrivateUsers=yes"]) if is_user else kept
+
+
+def project_build_properties(user: str, environment: Mapping[str, str]) -> dict[str, Property]:
+    """The properties of a build of a project where it is, but ExecStart= and the streams.
+
+    It has the rights of `user` and no sandbox, as if that user had built: caches in the home
+    directory count.
+    """
+    return typed(
+        Type="oneshot",
+        User=user,
+        WorkingDirectory="/",
+        Environment=environment_entries(environment),
+        NoNewPrivileges=True,
+        TimeoutStartSec=INFINITY,
+        TimeoutStopSec=_STOP,
+        KillMode="control-group",
+        CPUWeight=_SHARES,
+        IOWeight=_SHARES,
+        TasksMax=_MOST_TASKS,
+    )
 
 
 def _is_of_nodes(slot: str) -> bool:

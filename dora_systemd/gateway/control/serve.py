@@ -146,7 +146,7 @@ REFUSED: dict[str, tuple[str, str]] = {
     ),
     **dict.fromkeys(
         ("Build", "WaitForBuild", "BuildLogSubscribe"),
-        ("cannot build through the gateway", "dora build FILE --local, then start it"),
+        ("cannot build through the gateway", "doractl build FILE, then start it"),
     ),
     **dict.fromkeys(
         ("GetTraces", "GetTraceSpans"),

@@ -146,7 +146,7 @@ def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
     end_former(manager, build.unit)
     reading, writing = os.pipe2(os.O_CLOEXEC)
     try:
-        with _stopped(manager, build.unit):
+        with stopped_after_error(manager, build.unit):
             _start(manager, build, tree, reading)
             _wait(manager, build, tree)
         _check_end(manager, build)
@@ -163,7 +163,7 @@ def _start(manager: Manager, build: Build, tree: BuildTree, reading: int) -> Non
 
 
 @contextmanager
-def _stopped(manager: Manager, unit: str) -> Iterator[None]:
+def stopped_after_error(manager: Manager, unit: str) -> Iterator[None]:
     """Stop a unit after an exception, also if systemd may or may not have got its start."""
     try:
         yield

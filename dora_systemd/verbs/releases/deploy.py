@@ -270,7 +270,7 @@ def _at_source(
     """The error with the paths of the project: those of the copy are gone."""
     tree = str(store.tree(release))
     message, hint = (text.replace(tree, source.root) for text in (error.message, error.hint))
-    if source.dora and "dora build" in hint:
+    if source.dora and "doractl build" in hint:
         hint = "the build has to make it there"
     return DoraSystemdError(message, hint, error.code)
 

@@ -21,7 +21,7 @@ from dora_systemd.values import as_list, shown
 from dora_systemd.verbs.start.plan import Plan, make_plan
 from dora_systemd.verbs.start.read import read_files
 from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest, path_of
-from dora_systemd.verbs.start.where import account_of
+from dora_systemd.verbs.start.where import account_of, find_uv
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,8 @@ def find_builders(plan: Plan, dataflow: Dataflow, root: str) -> tuple[str, str]:
         with sight_of(account_of(plan.user)) as sight:
             directory = Path(plan.options.dataflow).parent
             has_nodes = has_nodes or any(_has_builds(directory, one, sight) for one in modules)
-            uv = _find_uv(plan, sight) if is_locked and not is_given else ""
+            path = plan.environment.get("PATH", "")
+            uv = find_uv(path, sight) if is_locked and not is_given else ""
     return plan.options.dora if has_nodes else "", uv
 
 
@@ -267,8 +268,3 @@ def _has_builds(directory: Path, module: object, sight: Sight) -> bool:
         return has_builds(parse_yaml(decoded(sight.read(str(path)), path), path))
     except (OSError, DoraSystemdError):
         return False
-
-
-def _find_uv(plan: Plan, sight: Sight) -> str:
-    places = plan.environment.get("PATH", "").split(os.pathsep)
-    return next((one for one in (f"{at}/uv" for at in places if at) if sight.is_program(one)), "")

@@ -26,6 +26,7 @@ from dora_systemd.verbs.start.startable import (
     check_startable,
     credential_files,
     plan_notes,
+    unbuilt_warnings,
 )
 from dora_systemd.verbs.start.where import (
     Look,
@@ -49,6 +50,7 @@ class Plan:
     user: pwd.struct_passwd | None  # for User=, None in user scope
     environment: Mapping[str, str]  # all of Environment=
     sandbox: Sandbox = field(default_factory=Sandbox)
+    warnings: tuple[str, ...] = ()  # for people, before it starts
     notes: tuple[str, ...] = ()  # for people, once it has started
     members: tuple["Member", ...] = ()  # the other machines, if it runs on several
     missing: DoraSystemdError | None = None  # why it cannot start before a build
@@ -74,7 +76,8 @@ def make_plan(scope: Scope, request: StartRequest, read: Files | None = None) ->
         where = find_where(scope, request, files, dataflow, look)
         check_credentials(scope, credential_files(settings))
         launch, missing = check_startable(where, sight, dataflow, request.is_unbuilt)
+        warnings = () if request.is_unbuilt else tuple(unbuilt_warnings(where.options, sight))
         notes = tuple(plan_notes(scope, settings, dataflow, launch, sight))
         sandbox = make_sandbox(scope, settings, user, Prepared(dataflow, launch, {}), sight)
     facts = (scope, where.options, settings, user, where.environment)
-    return Plan(*facts, sandbox, notes, where.members, missing)
+    return Plan(*facts, sandbox, warnings, notes, where.members, missing)

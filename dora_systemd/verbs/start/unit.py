@@ -49,6 +49,7 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     warnings = (
         *warnings,
         *passed_on(plan, number),
+        *plan.warnings,
         *idle_warnings(plan.settings),
         *watch_warnings(plan),
         *needs_warnings(needs, plan.options.needs, plan.sandbox.has_mounts, allowed),

@@ -41,6 +41,8 @@ DEFAULT_USER = "dora"
 """Runs the dataflows whose files belong to root; the package creates this user."""
 _MOST_DIGITS = 10  # of a uid
 _OWN = Sight()
+_UV_HOMES = (".local/bin", ".cargo/bin")
+"""Where uv installs itself; ssh and sudo have neither on PATH."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def find_where(
     path, settings = dataflow.source, look.settings
     search_path = request.environment.get("PATH") or os.defpath
     venv = look.find_venv(path, request.environment)
-    variables = _variables(settings, look.sight)
+    variables = given_variables(settings, look.sight)
     look.check_reach(path)
     options = RunnerOptions(
         name=files.name,
@@ -141,9 +143,7 @@ def find_where(
 
         require_watcher()
     options, members = _spread(dataflow, options, settings, variables)
-    # Root's variables are not for the file of another user, which could read them out.
-    is_own = scope.is_user or files.place.uid == os.geteuid()
-    called = called_variables(dataflow, request.environment if is_own else {})
+    called = caller_variables(scope, request, files, dataflow)
     environment = unit_environment(search_path, venv, {**called, **variables})
     return Where(options, members, environment)
 
@@ -165,7 +165,27 @@ def _spread(
     return spread(dataflow, options, settings, variables, os.uname().nodename, source_address)
 
 
-def _variables(settings: Settings, sight: Sight) -> dict[str, str]:
+def caller_variables(
+    scope: Scope, request: StartRequest, files: Files, dataflow: Dataflow
+) -> dict[str, str]:
+    """The variables of the caller that the dataflow names.
+
+    Root's are not for the file of another user, which could read them out.
+    """
+    is_own = scope.is_user or files.place.uid == os.geteuid()
+    return called_variables(dataflow, request.environment if is_own else {})
+
+
+def find_uv(search_path: str, sight: Sight, home: str = "") -> str:
+    """Find uv on a PATH, or where it installs itself below a home directory; "" if it is not there.
+
+    home: "" for no home directory. sight: of the account that runs it.
+    """
+    places = [*search_path.split(os.pathsep), *(f"{home}/{one}" for one in _UV_HOMES if home)]
+    return next((one for one in (f"{at}/uv" for at in places if at) if sight.is_program(one)), "")
+
+
+def given_variables(settings: Settings, sight: Sight) -> dict[str, str]:
     """The variables of --env and --env-file; --env has precedence, then the last file."""
     variables: dict[str, str] = {}
     for file in settings[ENV_FILE]:

@@ -128,7 +128,7 @@ def test_every_option_says_what_it_does(name: str) -> None:
         (["strat"], "unknown command 'strat'", "did you mean doractl start?"),
         (["ls"], "unknown command 'ls'", "did you mean doractl list?"),
         (["tail"], "unknown command 'tail'", "did you mean doractl logs NAME --follow?"),
-        (["build"], "unknown command 'build'", "dora build FILE builds the nodes, doractl deploy"),
+        (["biuld"], "unknown command 'biuld'", "did you mean doractl build?"),
         (["qqq"], "unknown command 'qqq'", "doractl --help lists all commands"),
         (["membe"], "unknown command 'membe'", "doractl --help lists all commands"),
         (["list", "--oll"], "unknown option --oll", "did you mean --all?"),

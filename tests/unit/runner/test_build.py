@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shlex
 import socket
 import subprocess
 import sys
@@ -13,10 +14,12 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.life.states import RunnerExit
-from dora_systemd.decisions.releases.build import BuildTask
-from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.build import Output, build, main
+from dora_systemd.decisions.releases.build import BuildTask, format_task
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.runner.build import Output, ToJournal, ToReader, build, main
+from tests.unit.fakes.programs import make_program
 
 PROGRAM = (sys.executable, "-m", "dora_systemd.runner.build")
 
@@ -48,7 +51,7 @@ def output_of(*script: str, directory: Path) -> tuple[list[bytes], str]:
     task = BuildTask("robot", "uuid", "20260101T000000", str(directory), commands)
     journal, error = Journal(), ""
     try:
-        build(task, Output(task, journal))
+        build(task, Output(ToJournal(task, journal)))
     except DoraSystemdError as refusal:
         error = refusal.message
     return journal.entries, error
@@ -88,7 +91,7 @@ def test_what_is_said_of_uv(tmp_path: Path, script: str, expected: str) -> None:
     uv.chmod(0o755)
     task = BuildTask("robot", "uuid", "20260101T000000", str(tmp_path), ((str(uv), "sync"),))
     with pytest.raises(DoraSystemdError) as caught:
-        build(task, Output(task, Journal()))
+        build(task, Output(ToJournal(task, Journal())))
     assert caught.value.message.endswith(expected)
 
 
@@ -118,11 +121,68 @@ def test_it_ends_with_doractl(tmp_path: Path) -> None:
         assert child.wait(60) == 1
 
 
+def test_it_ends_with_doractl_and_so_do_groups_of_dora(tmp_path: Path) -> None:
+    """dora starts build commands in process groups of their own."""
+    script = "import os,time; os.setpgid(0,0); open('begun','w').write(str(os.getpid())); "
+    commands = ((sys.executable, "-c", f"{script}time.sleep(1000)"),)
+    shell = f"{shlex.join(commands[0])} & trap '' INT; wait"
+    task = BuildTask("robot", "", "", str(tmp_path), (("sh", "-c", shell),), is_shown=True)
+    with subprocess.Popen((*PROGRAM, format_task(task)), stdin=subprocess.PIPE) as child:
+        while not (tmp_path / "begun").exists() or not (tmp_path / "begun").read_text():
+            assert child.poll() is None
+        assert child.stdin
+        child.stdin.close()
+        assert child.wait(60) == 1
+    stat = Path("/proc", (tmp_path / "begun").read_text(), "stat")
+    assert not stat.exists() or ") Z" in stat.read_text()
+
+
+def shown(directory: Path, script: str, name: str = "dora") -> tuple[str, str, int]:
+    """What a build writes to both streams for a reader, and its exit status."""
+    program = make_program(directory / name, script)
+    task = BuildTask("x.yml", "", "", str(directory), ((program, "build"),), is_shown=True)
+    with subprocess.Popen(
+        (*PROGRAM, format_task(task)), stdin=-1, stdout=-1, stderr=-1, text=True
+    ) as child:
+        assert child.stdout and child.stderr
+        return child.stdout.read(), child.stderr.read(), child.wait()
+
+
+def test_what_a_reader_gets(tmp_path: Path) -> None:
+    out, err, status = shown(tmp_path, "printf '\\033[1mone\\033[0m\\n'; echo two >&2")
+    assert (out, err, status) == ("one\ntwo\n", "", 0)
+
+
+DORA_FAILS = """echo 'a: stdout   all is lost'
+echo '[ERROR]'
+echo 'failed to build node `a`'
+echo
+echo 'Caused by:'
+echo '   0: build command failed'
+echo '   1: build command `make` returned exit status: 2'
+exit 1"""
+
+
+def test_a_node_that_fails_is_named_in_one_line(tmp_path: Path) -> None:
+    out, err, status = shown(tmp_path, DORA_FAILS)
+    assert out == "a: stdout   all is lost\n"
+    expected = "node a: build command `make` returned exit status: 2; its last line: a: all is lost"
+    refusal = parse_refusal(err.strip(), status)
+    assert refusal and refusal.message == f"cannot build x.yml: {expected}"
+
+
+def test_no_dora(tmp_path: Path) -> None:
+    task = BuildTask("x.yml", "", "", str(tmp_path), ((f"{tmp_path}/dora", "build"),))
+    with pytest.raises(DoraSystemdError, match=r"cannot run .*dora: No such file") as caught:
+        build(task, Output(ToReader()))
+    assert caught.value.code is ExitCode.NO_DORA
+
+
 def test_no_line_is_lost_while_journald_restarts(tmp_path: Path) -> None:
     """It may take longer than a refused connection, which comes back at once."""
     path = tmp_path / "socket"
     journal = JournalSocket(str(path))
-    output = Output(BuildTask("robot", "uuid", "r", "/", ()), journal)
+    output = Output(ToJournal(BuildTask("robot", "uuid", "r", "/", ()), journal))
     with (
         contextlib.closing(journal),
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as server,

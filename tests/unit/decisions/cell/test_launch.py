@@ -203,10 +203,14 @@ def test_refusals(node: dict[str, Any], words: str) -> None:
 
 HINTS: tuple[tuple[dict[str, Any], tuple[str, ...], str], ...] = (
     ({"path": "robot-camera"}, (), "correct the path of the node"),
-    ({"path": "robot-camera"}, ("/p/uv.lock",), "run `uv sync` in /p first"),
+    ({"path": "robot-camera"}, ("/p/uv.lock",), "run `doractl build flow.yml` first, or"),
     ({"path": "src/nope.py"}, ("/p/uv.lock",), "correct the path of the node"),
-    ({"path": "robot-camera", "build": "make"}, ("/p/uv.lock",), "run `dora build flow.yml` first"),
-    ({"path": "a.py", "git": "https://example.org/x"}, (), "run `dora build flow.yml` first"),
+    (
+        {"path": "robot-camera", "build": "make"},
+        ("/p/uv.lock",),
+        "run `doractl build flow.yml` first",
+    ),
+    ({"path": "a.py", "git": "https://example.org/x"}, (), "run `doractl build flow.yml` first"),
 )
 
 

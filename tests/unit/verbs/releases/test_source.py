@@ -78,7 +78,7 @@ def test_uv_makes_the_programs_of_a_clone(tmp_path: Path) -> None:
 def test_nothing_makes_the_programs_of_a_clone_without_uv(tmp_path: Path) -> None:
     with pytest.raises(DoraSystemdError, match=r"'robot-camera' is neither in") as caught:
         clone_of(tmp_path)
-    assert f"run `uv sync` in {tmp_path}/clone first" in str(caught.value.hint)
+    assert f"run `doractl build {tmp_path}/clone/{FLOW}` first" in str(caught.value.hint)
 
 
 def test_what_a_dataflow_names_belongs_to_its_release() -> None:

@@ -461,14 +461,25 @@ def test_a_build_that_is_missing_or_older_than_the_dataflow(project: Path) -> No
     assert plan_of(project).notes == ()
     flow.write_text("nodes: [{id: a, path: a.py, build: make}]\n")
     (note,) = plan_of(project).notes
-    assert note == f"no build of {flow} is found; to build it: dora build {flow}"
+    assert note == f"no build of {flow} is found; to build it: doractl build {flow}"
     session.parent.mkdir()
     session.write_text("local_build: {node_working_dirs: {a: /x}}\n")
     os.utime(flow, (1000, 1000))
     assert plan_of(project).notes == ()
     os.utime(session, (500, 500))
     (note,) = plan_of(project, uv=True).notes
-    assert note.endswith(f"newer than its last build; to build again: dora build --uv {flow}")
+    assert note.endswith(f"newer than its last build; to build again: doractl build --uv {flow}")
+
+
+def test_a_project_that_uv_has_not_built(project: Path) -> None:
+    assert plan_of(project).warnings == ()
+    (project / "uv.lock").write_text("")
+    (warning,) = plan_of(project).warnings
+    end = f"no .venv; to make it: doractl build {project}/robot.yml"
+    assert warning == f"{project} has uv.lock and the nodes have {end}"
+    assert plan_of(project, uv=True).warnings == ()
+    make_program(project / ".venv/bin/python")
+    assert plan_of(project).warnings == ()
 
 
 def test_rust_log_of_the_owner(project: Path) -> None:
