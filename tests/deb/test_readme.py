@@ -21,7 +21,11 @@ KEYS = {"doractl top": ("plot", b"q"), "doractl run": ("frame ", b"\x03")}
 """Commands that wait for a key: when to press it, and which."""
 FROM_NOTHING = ("README.md", "docs/first-steps.md", "docs/robot-arm.md")
 WITH_ROBOT = tuple(
-    f"docs/{name}.md" for name in ("run-at-boot", "logs", "sandbox", "releases", "monitoring")
+    f"docs/{name}.md"
+    for name in (
+        *("run-at-boot", "logs", "sandbox", "releases", "monitoring", "production"),
+        "coming-from",
+    )
 )
 """Pages about a robot that is already in PLACE."""
 PLACE, ARM = Path("/srv/robot"), Path("/srv/arm")

@@ -1,4 +1,4 @@
-"""README and pages of docs/: what stands in them without being typed is checked here."""
+"""READMEs and pages of docs/: what stands in them without being typed is checked here."""
 
 import re
 
@@ -8,7 +8,7 @@ from dora_systemd.decisions.views import prometheus
 from dora_systemd.decisions.views.prometheus import Family
 from tests.unit.checkout import CHECKOUT
 
-PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+PAGES = [*CHECKOUT.glob("README*.md"), *sorted((CHECKOUT / "docs").glob("*.md"))]
 
 
 def test_links_lead_somewhere() -> None:
@@ -18,7 +18,21 @@ def test_links_lead_somewhere() -> None:
 
 
 def test_readme_is_short() -> None:
-    assert len((CHECKOUT / "README.md").read_text().splitlines()) <= 200
+    lines = (CHECKOUT / "README.md").read_text().splitlines()
+    assert len(lines) <= 200
+    assert "make demo" in "\n".join(lines[:100]) and "make test" in "\n".join(lines[:100])
+
+
+def test_both_readmes_have_the_same_blocks_and_links() -> None:
+    """What is typed in one is typed in the other; tests/deb types those of README.md."""
+    texts = [(CHECKOUT / name).read_text() for name in ("README.md", "README.zh-CN.md")]
+    blocks, links = (
+        [re.findall(pattern, text, re.DOTALL | re.MULTILINE) for text in texts]
+        for pattern in (r"^```.*?^```$", r"\]\((docs/[^)]*)\)")
+    )
+    assert blocks[0] == blocks[1]
+    assert set(links[0]) == set(links[1])
+    assert "](README.zh-CN.md)" in texts[0] and "](README.md)" in texts[1]
 
 
 def test_alerts_are_about_metrics_that_exist() -> None:
