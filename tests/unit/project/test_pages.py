@@ -6,8 +6,11 @@ import yaml
 
 from dora_systemd.decisions.views import prometheus
 from dora_systemd.decisions.views.prometheus import Family
+from tests.deb.picture import lines_of_readme, text_of
+from tests.system.typed import command_of, typed_lines
 from tests.unit.checkout import CHECKOUT
 
+PICTURE = CHECKOUT / "docs/first-minute.svg"
 PAGES = [*CHECKOUT.glob("README*.md"), *sorted((CHECKOUT / "docs").glob("*.md"))]
 
 
@@ -33,6 +36,15 @@ def test_both_readmes_have_the_same_blocks_and_links() -> None:
     assert blocks[0] == blocks[1]
     assert set(links[0]) == set(links[1])
     assert "](README.zh-CN.md)" in texts[0] and "](README.md)" in texts[1]
+
+
+def test_the_picture_shows_what_readme_says() -> None:
+    """So it is as true as README.md, which tests/deb types: tests/deb/picture.py draws it."""
+    shown = {one.line: one.shown for one in typed_lines(text_of(PICTURE.read_text()))}
+    said = {command_of(one.line).rstrip(): one for one in lines_of_readme()}
+    assert len(shown) == 5
+    for line, text in shown.items():
+        assert text and said[line].fits(text, 0), line
 
 
 def test_alerts_are_about_metrics_that_exist() -> None:
