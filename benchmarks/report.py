@@ -128,7 +128,7 @@ def format_full(records: dict[str, Record]) -> str:
 
 def format_short(records: dict[str, Record]) -> str:
     """The lines that README.md has."""
-    lines = ["| | doractl | beside | ratio, spread |", "|---|---|---|---|"]
+    lines = ["| | doractl | compared with | ratio, spread |", "|---|---|---|---|"]
     for name, what, rival in HIGHLIGHTS:
         figures = records[name].figures if name in records else ()
         for figure in (one for one in figures if one.what == what and rival in one.values):
