@@ -1,0 +1,1 @@
+"""A module for each verb, in the section of `doractl --help` that lists it."""

@@ -1,0 +1,1 @@
+"""The tree below /sys/fs/cgroup: groups of nodes, limits, usage."""

@@ -1,0 +1,1 @@
+"""The dora command, coordinator and daemon, and dora's checks of a dataflow."""

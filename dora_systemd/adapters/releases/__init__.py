@@ -1,0 +1,4 @@
+"""The store of releases on disk.
+
+`draft.py` writes a release and publishes it by a rename.
+"""

@@ -1,0 +1,1 @@
+"""Dora's frames, error texts, coordinator and command."""

@@ -1,0 +1,1 @@
+"""Bytes become lines, lines become fields of the journal; queries and formats of logs."""

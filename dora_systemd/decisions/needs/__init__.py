@@ -1,0 +1,1 @@
+"""What nodes wait for: steps, dependencies of the unit, devices of the sandbox."""

@@ -1,0 +1,1 @@
+"""Outputs that nodes owe: which, the probe that receives them, which node is silent."""

@@ -14,7 +14,7 @@ from tests.system.releases import Releases, write_version
 
 pytestmark = pytest.mark.lab
 
-ROUNDS = int(os.environ.get("ROUNDS", "8"))
+ROUNDS = int(os.environ.get("ROUNDS", "5"))
 
 
 def test_it_can_be_killed_at_any_moment(releases: Releases, project: Project) -> None:
