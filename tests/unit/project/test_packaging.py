@@ -98,6 +98,20 @@ def test_all_manuals_are_installed() -> None:
     assert sorted(listed) == sorted(there)
 
 
+def test_needrestart_leaves_dataflows_alone() -> None:
+    """The file is evaluated by needrestart, which then takes the first pattern that matches."""
+    file = CHECKOUT / "packaging/needrestart/50-dora-systemd.conf"
+    script = (
+        "our %nrconf; my $file = shift; my $text = do { local (@ARGV, $/) = $file; <> }; "
+        "eval $text; die $@ if $@; "
+        "for my $rc (@ARGV) { print grep({ $rc =~ /$_/ } keys %{$nrconf{override_rc}}) ? 1 : 0 }"
+    )
+    units = ("dora-robot.service", "doralink-robot:gpu.service", "dora-gateway.service")
+    command = ("perl", "-we", script, str(file), *units, "ssh.service", "dora.slice")
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("11000", "")
+
+
 @pytest.mark.parametrize("debian", DEBIANS, ids=str)
 def test_overrides_say_why(debian: Path) -> None:
     for path in [*debian.glob("*lintian-overrides"), *debian.glob("source/lintian-overrides")]:
