@@ -32,6 +32,8 @@ _TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
 _FIRST_PERSON = 1000
 """Users with smaller numbers are system accounts."""
 _environment = _thread.allocate_lock()  # threading takes a while to load
+_CONTAINER_MARKS = (".dockerenv", "run/.containerenv")
+"""Files by which docker and podman mark a container."""
 _CLOSE = (-1, None)
 """pystemd's mark for the end of a container."""
 
@@ -216,9 +218,24 @@ def silent_bus(scope: Scope, is_private: bool) -> DoraSystemdError:
     return DoraSystemdError(message, f"see systemctl {flag}{verb}", ExitCode.NO_SYSTEMD)
 
 
+def without_systemd(root: Path = Path("/")) -> str:
+    """Tell how a machine that was not booted with systemd gets one. root: has all its files."""
+    try:
+        kernel = (root / "proc/sys/kernel/osrelease").read_text(errors="replace").lower()
+    except OSError:
+        kernel = ""
+    if "microsoft" in kernel:
+        how = "write systemd=true below [boot] in /etc/wsl.conf, then run: wsl --shutdown"
+        return f"WSL starts systemd only if told to: {how}"
+    if any((root / mark).exists() for mark in _CONTAINER_MARKS):
+        how = "boot it with /sbin/init, as podman run --systemd=always does, or use its host"
+        return f"this container runs no systemd: {how}"
+    return "this machine was not booted with systemd: make it the init system, and boot again"
+
+
 def _connection_hint(scope: Scope) -> str:
     if not Path("/run/systemd/system").is_dir():
-        return "this machine was not booted with systemd"
+        return without_systemd()
     if not scope.is_user:
         return "see systemctl is-system-running"
     user = user_name(scope.uid, nameless="")

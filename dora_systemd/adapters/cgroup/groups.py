@@ -53,7 +53,7 @@ def mount_point() -> Path:
             return place
     raise DoraSystemdError(
         "cannot find the cgroup v2 hierarchy below /sys/fs/cgroup",
-        "dora-systemd needs Linux with cgroup v2, as systemd 252 and newer set it up",
+        "boot with systemd.unified_cgroup_hierarchy=1 on the command line of the kernel",
         ExitCode.NO_SYSTEMD,
     )
 
