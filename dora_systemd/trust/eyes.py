@@ -5,11 +5,16 @@ text of this file: that user may not be able to read our package.
 """
 
 import errno
+import itertools
 import os
 import stat
 import sys
 
 _PART = 32 * 1024
+_HEAD = 256
+"""Bytes of a program that say how it is executed."""
+_MOST_ENTRIES = 10_000
+_MOST_NAMES = 16
 
 
 def check_regular(mode: int) -> None:
@@ -45,6 +50,10 @@ def answer(letter: bytes, path: bytes, most: int) -> bytes:
         return os.path.realpath(path)
     if letter == b"r":
         return read_regular(path, most)
+    if letter == b"h":
+        return read_regular(path, _HEAD)
+    if letter == b"n":
+        return b"\0".join(_names(path))
     found = os.stat(path)  # noqa: PTH116 - a Path has no bytes
     if letter == b"m":
         return b"%d" % found.st_mtime_ns
@@ -56,6 +65,15 @@ def answer(letter: bytes, path: bytes, most: int) -> bytes:
         b"w": os.access(path, os.W_OK),
     }
     return b"1" if is_so[letter] else b""
+
+
+def _names(prefix: bytes) -> list[bytes]:
+    """The first names in a directory that begin as the last part of `prefix`."""
+    directory, _, begin = prefix.rpartition(b"/")
+    with os.scandir(directory or b"/") as entries:
+        some = itertools.islice(entries, _MOST_ENTRIES)
+        found = (one.name for one in some if one.name.startswith(begin))
+        return list(itertools.islice(found, _MOST_NAMES))
 
 
 def main(most: int) -> None:

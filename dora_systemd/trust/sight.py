@@ -63,6 +63,18 @@ class Sight:
         """The content of a regular file, at most MAX_BYTES + 1 bytes. Raises OSError."""
         return self._ask(b"r", path)
 
+    def head(self, path: str) -> bytes:
+        """The first bytes of a regular file. Raises OSError."""
+        return self._ask(b"h", path)
+
+    def names(self, prefix: str) -> list[str]:
+        """Some names in the directory of `prefix` that begin as its last part."""
+        try:
+            found = os.fsdecode(self._ask(b"n", prefix))
+        except OSError:
+            return []
+        return [one for one in found.split("\0") if one and "/" not in one and one != ".."]
+
     def modified_ns(self, path: str) -> int:
         """When the file was last written, ns since 1970; 0 if there is none."""
         with contextlib.suppress(OSError, ValueError):

@@ -162,15 +162,13 @@ def _check_user(read: Read) -> None:
 def _project(read: Read) -> Project:
     settings, look, path = read.look.settings, read.look, read.dataflow.source
     home = str(Path.home()) if look.user is None else look.user.pw_dir
-    venv = look.find_venv(path, read.request.environment)
     search_path = read.request.environment.get("PATH") or os.defpath
     lock = _find_lock(read)
     uv = find_uv(search_path, look.sight, home)
     if lock and not uv:
         reason = f"{shown(f'{lock}/{LOCK}')} needs uv, which is not in PATH"
         raise _refusal(path, reason, "install uv, see https://docs.astral.sh/uv")
-    if lock:
-        venv = _venv_of(read, lock)
+    venv = _venv_of(read, lock) if lock else look.find_venv(path, read.request.environment)
     dora = _find_dora(read, venv, search_path, is_made=bool(lock))
     called = caller_variables(read.scope, read.request, read.files, read.dataflow)
     variables = {**called, **given_variables(settings, look.sight)}

@@ -6,6 +6,7 @@ Checks that need systemd are left out if it cannot be reached.
 import os
 import pwd
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager
@@ -40,17 +41,23 @@ from dora_systemd.decisions.views.findings import (
     judge_real_time,
     storage_of,
 )
+from dora_systemd.decisions.views.upkeep import judge_core_pattern, judge_reboots
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of
+from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
+from dora_systemd.trust.programs import account_from
+from dora_systemd.trust.sight import sight_of
 from dora_systemd.trust.socket_table import TABLES, listening_sockets
+from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.logins import PASSWD, is_lingering, judge_logins, linger_command
+from dora_systemd.verbs.start.programs import version_warnings
 from dora_systemd.verbs.start.read import config_files
 from dora_systemd.verbs.start.settings import check_config
 from dora_systemd.verbs.start.where import DEFAULT_USER
@@ -238,6 +245,30 @@ def _dora(_scope: Scope, _root: Path) -> Iterator[Finding]:
         yield Finding("dora", State.OK, f"{dora}, version {version}")
 
 
+def _versions(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
+    """Compare the dora of nodes with that of their daemon, as their user sees the files."""
+    del scope
+    for cell in read_cells(manager):
+        user = manager.read(cell.unit, ["User"])["User"]
+        account = account_from(pwd.getpwnam(user)) if user else None
+        with sight_of(account) as sight:
+            for text in version_warnings(cell.options.venv, cell.options.dora, sight):
+                yield Finding("versions", State.WARNING, f"{cell.name}: {text}")
+
+
+def _coredumps(_scope: Scope, root: Path) -> Iterator[Finding]:
+    with suppress(OSError):
+        pattern = (root / "proc/sys/kernel/core_pattern").read_text(errors="replace")
+        yield judge_core_pattern(pattern)
+
+
+def _upgrades(_scope: Scope, root: Path) -> Iterator[Finding]:
+    with suppress(OSError, DoraSystemdError):
+        files = sorted((root / "etc/apt/apt.conf.d").iterdir())
+        texts = (read_file(one).data.decode(errors="replace") for one in files)
+        yield from judge_reboots("\n".join(texts))
+
+
 def _user(scope: Scope, _root: Path) -> Iterator[Finding]:
     if scope.is_user:
         return
@@ -282,5 +313,5 @@ def _below(root: Path, path: Path) -> Path:
     return root / path.relative_to("/")
 
 
-_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports, _releases)
-_WITHOUT = (_dora, _user, _logins, _settings, _processes, _real_time)
+_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports, _releases, _versions)
+_WITHOUT = (_dora, _user, _logins, _settings, _processes, _real_time, _coredumps, _upgrades)

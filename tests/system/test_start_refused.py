@@ -1,6 +1,8 @@
 """What doractl start refuses: one line and a hint, the exit status, and nothing left behind."""
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -188,3 +190,45 @@ def test_a_restart_that_would_be_refused_stops_nothing(cell: Cell, project: Proj
     project.three_nodes()
     cell.doractl("restart", cell.name)
     assert cell.show("MainPID") != main_pid
+
+
+def link_venv(venv: Path, python: Path) -> None:
+    """A virtual environment with that Python, as uv and python3 -m venv make it."""
+    shutil.rmtree(venv, ignore_errors=True)
+    (venv / "bin").mkdir(parents=True)
+    (venv / "pyvenv.cfg").write_text("home = /usr/bin\nversion = 3.13.5\n")
+    (venv / "bin/python").symlink_to(python)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root starts the nodes of others")
+def test_pythons_that_the_user_of_the_nodes_cannot_execute(cell: Cell, project: Project) -> None:
+    """Refused by name, never by an exit status of systemd; the others start."""
+    flow, venv = project.three_nodes(), project.root / ".venv"
+    own = Path("/usr/bin/python3").resolve()
+    with tempfile.TemporaryDirectory(dir="/root") as hidden:
+        uvs = shutil.copy2(own, f"{hidden}/python3")
+        foreign = Path(project.root / "foreign")
+        head = own.read_bytes()[:64]
+        machine = {62: 183}.get(int.from_bytes(head[18:20], "little"), 62)
+        foreign.write_bytes(head[:18] + machine.to_bytes(2, "little") + head[20:])
+        foreign.chmod(0o755)
+        bad = {
+            Path(uvs): "is behind /root, which user dora cannot enter",
+            Path("/opt/removed/bin/python3"): "/opt/removed/bin/python3, does not exist",
+            foreign: "and this machine is",
+        }
+        if any(Path("/proc/sys/fs/binfmt_misc").glob("qemu-*")):
+            del bad[foreign]  # it can be executed
+        for python, expected in bad.items():
+            link_venv(venv, python)
+            done = cell.start(flow, check=False)
+            assert expected in done.stderr, (python, done.stderr)
+            assert done.stderr.startswith(f"doractl: cannot use {venv}/bin/python: the program ")
+            assert done.stderr.count("\n") == 2
+    conda = project.root / "conda"
+    (conda / "bin").mkdir(parents=True)
+    shutil.copy2(own, conda / "bin/python")
+    link_venv(venv, own)
+    for words in ((), ("--venv", str(conda))):
+        done = cell.start(flow, "--dry-run", *words)
+        assert "ExecStart=" in done.stdout

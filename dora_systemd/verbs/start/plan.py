@@ -26,7 +26,7 @@ from dora_systemd.verbs.start.startable import (
     check_startable,
     credential_files,
     plan_notes,
-    unbuilt_warnings,
+    start_warnings,
 )
 from dora_systemd.verbs.start.where import (
     Look,
@@ -76,7 +76,7 @@ def make_plan(scope: Scope, request: StartRequest, read: Files | None = None) ->
         where = find_where(scope, request, files, dataflow, look)
         check_credentials(scope, credential_files(settings))
         launch, missing = check_startable(where, sight, dataflow, request.is_unbuilt)
-        warnings = () if request.is_unbuilt else tuple(unbuilt_warnings(where.options, sight))
+        warnings = () if request.is_unbuilt else tuple(start_warnings(where, dataflow, sight))
         notes = tuple(plan_notes(scope, settings, dataflow, launch, sight))
         sandbox = make_sandbox(scope, settings, user, Prepared(dataflow, launch, {}), sight)
     facts = (scope, where.options, settings, user, where.environment)

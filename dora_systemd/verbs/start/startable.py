@@ -9,6 +9,7 @@ from dora_systemd.adapters.dora.preparation import check_named_nodes
 from dora_systemd.adapters.host.files import absolute_path, decoded, parse_yaml
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.uv import uv_project
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
     Dataflow,
@@ -25,6 +26,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import reached
 from dora_systemd.trust.sight import Sight
 from dora_systemd.values import shown
+from dora_systemd.verbs.start.programs import version_warnings
 from dora_systemd.verbs.start.where import Where
 
 
@@ -78,6 +80,19 @@ def plan_notes(
         yield f"no build of {path} is found; to build it: doractl build {uv}{path}"
     elif _is_build_old(dataflow, sight):
         yield f"{path} is newer than its last build; to build again: doractl build {uv}{path}"
+
+
+def start_warnings(where: Where, dataflow: Dataflow, sight: Sight) -> Iterator[str]:
+    """Warn of what keeps Python nodes from working. Raises DoraSystemdError for what must."""
+    yield from unbuilt_warnings(where.options, sight)
+    if any(node.kind in (NodeKind.PYTHON, NodeKind.OPERATOR) for node in dataflow.nodes):
+        yield from version_warnings(_nodes_venv(where.options, sight), where.options.dora, sight)
+
+
+def _nodes_venv(options: RunnerOptions, sight: Sight) -> str | None:
+    """The virtual environment of Python nodes; `uv run` takes that of its project."""
+    project = uv_project(options.working_directory, sight.read) if options.uv else None
+    return f"{project}/.venv" if project else options.venv
 
 
 def unbuilt_warnings(options: RunnerOptions, sight: Sight) -> Iterator[str]:

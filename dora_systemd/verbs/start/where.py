@@ -8,7 +8,7 @@ clearer errors.
 import os
 import pwd
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +31,7 @@ from dora_systemd.trust.paths import Place, reached, user_name
 from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.trust.sight import Sight, cannot_reach
 from dora_systemd.values import quoted, shown
+from dora_systemd.verbs.start.programs import check_program
 from dora_systemd.verbs.start.read import Files
 from dora_systemd.verbs.start.request import StartRequest
 
@@ -54,13 +55,34 @@ class Look:
     user: pwd.struct_passwd | None  # None: the caller, as itself
     directory: str  # absolute, where relative paths begin
 
-    def find_venv(self, dataflow: str, environment: Mapping[str, str]) -> str | None:
-        """--venv, else the caller's VIRTUAL_ENV, else .venv beside the dataflow, else None."""
+    def find_venv(
+        self, dataflow: str, environment: Mapping[str, str], is_unbuilt: bool = False
+    ) -> str | None:
+        """--venv, else the caller's VIRTUAL_ENV, else .venv beside the dataflow, else None.
+
+        is_unbuilt: a build replaces one whose Python cannot be executed. Raises DoraSystemdError
+        for that otherwise.
+        """
         given = self.settings[VENV]
         if given is not None:
             return self._checked_venv(str(Path(given).absolute()))
         places = [environment.get("VIRTUAL_ENV", ""), str(Path(dataflow).parent / ".venv")]
-        return next((one for one in places if one.startswith("/") and self._is_venv(one)), None)
+        there = [one for one in places if one.startswith("/") and self._is_venv(one)]
+        return self._usable(there, is_unbuilt)
+
+    def _usable(self, venvs: Sequence[str], is_unbuilt: bool) -> str | None:
+        """The first one whose Python the user can execute. Raises the error of the first other."""
+        problems = []
+        for one in venvs:
+            try:
+                check_program(f"{one}/bin/python", self.sight, self.user)
+            except DoraSystemdError as error:
+                problems.append(error)
+            else:
+                return one
+        if problems and not is_unbuilt:
+            raise problems[0]
+        return None
 
     def _checked_venv(self, venv: str) -> str:
         if not self._is_venv(venv):
@@ -70,10 +92,11 @@ class Look:
                 f"python3 -m venv {venv}",
                 ExitCode.BAD_INPUT,
             )
-        return venv
+        return self._usable([venv], is_unbuilt=False) or venv
 
     def _is_venv(self, venv: str) -> bool:
-        return self.sight.exists(f"{venv}/bin/python")
+        """Whether it is one, also if its Python leads nowhere."""
+        return any(self.sight.exists(f"{venv}/{one}") for one in ("bin/python", "pyvenv.cfg"))
 
     def check_reach(self, dataflow: str) -> None:
         """Raise DoraSystemdError for a working directory, or files, that the user cannot access."""
@@ -89,11 +112,13 @@ class Look:
         is_given = self.settings.source(DORA) != "default"
         given = self.settings[DORA] if is_given else None
         try:
-            return find_dora(given, venv, search_path, self.sight)
+            found = find_dora(given, venv, search_path, self.sight)
         except DoraSystemdError:
             if not self._is_named_in_file(DORA):
                 self._blame(DORA, find_dora(given, None, search_path), is_there=True)
             raise
+        check_program(found, self.sight, self.user)
+        return found
 
     def _blame(self, setting: Setting[Any], path: str, is_there: bool) -> None:
         """Raise DoraSystemdError for a path that root can see and the user cannot."""
@@ -119,7 +144,7 @@ def find_where(
     """Find programs and machines. Raises DoraSystemdError."""
     path, settings = dataflow.source, look.settings
     search_path = request.environment.get("PATH") or os.defpath
-    venv = look.find_venv(path, request.environment)
+    venv = look.find_venv(path, request.environment, request.is_unbuilt)
     variables = given_variables(settings, look.sight)
     look.check_reach(path)
     options = RunnerOptions(

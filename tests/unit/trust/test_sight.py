@@ -87,6 +87,21 @@ def test_what_is_there(sight: Sight, place: Path) -> None:
     assert sight.read(str(place / "text")) == b"words"
     assert sight.modified_ns(str(place / "text")) == 1_767_225_600_000_000_001
     assert sight.modified_ns(str(place / "missing")) == 0
+    (place / "text").write_text("x" * 1000)
+    assert sight.head(str(place / "text")) == b"x" * 256
+    with pytest.raises(FileNotFoundError):
+        sight.head(str(place / "missing"))
+
+
+def test_names_that_begin_alike(sight: Sight, place: Path) -> None:
+    for name in ("dora_rs-1", "dora_rs-2", "dora_rs_cli-1", "x"):
+        (place / name).mkdir()
+    assert sorted(sight.names(f"{place}/dora_rs-")) == ["dora_rs-1", "dora_rs-2"]
+    assert sight.names(f"{place}/y") == sight.names(f"{place}/missing/x") == []
+    assert sight.names(f"{place}/\0") == []
+    for number in range(40):
+        (place / f"many-{number}").mkdir()
+    assert len(sight.names(f"{place}/many-")) == 16
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_dora, make_program
+from tests.unit.verbs.start.test_programs import install
 from tests.unit.verbs.start.test_start import make_plan, place
 
 
@@ -114,6 +115,27 @@ def test_without_journald_one_line_says_so(
         (line,) = journal_lines(manager, scope)
         assert line == "warning: systemd-journald does not run: no line is kept"
         (tmp_path / "var/log/journal/machine/system.journal").unlink(missing_ok=True)
+
+
+def test_what_others_have_set_up(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
+    for name, text in {
+        "proc/sys/kernel/core_pattern": "|/usr/share/apport/apport -p%p\n",
+        "etc/apt/apt.conf.d/20auto-upgrades": 'APT::Periodic::Unattended-Upgrade "1";\n',
+        "etc/apt/apt.conf.d/50unattended": 'Unattended-Upgrade::Automatic-Reboot "true";\n',
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    findings = found(manager, scope)
+    assert findings["core dumps"].state is State.NOTE
+    assert findings["upgrades"].state is State.WARNING
+
+
+def test_nodes_with_another_dora(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
+    venv = install(tmp_path / "venv", "dora_rs", "1.0.1")
+    prefix = install(tmp_path / "tool", "dora_rs_cli", "1.1.0")
+    manager.add(options(venv=venv, dora=f"{prefix}/bin/dora"))
+    expected = "robot: the nodes' dora is 1.0.1, the daemon is 1.1.0: "
+    assert found(manager, scope)["versions"].text.startswith(expected)
 
 
 def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:

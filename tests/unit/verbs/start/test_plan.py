@@ -29,6 +29,7 @@ from dora_systemd.verbs.start.request import StartRequest, request_name
 from dora_systemd.verbs.start.settings import check_config, require_modest, settings_of
 from dora_systemd.verbs.start.where import account_of, choose_user
 from tests.unit.fakes.programs import make_dora, make_program
+from tests.unit.verbs.start.test_programs import install
 
 USER = Scope(is_user=True, uid=os.getuid())
 SYSTEM = Scope(is_user=False, uid=os.getuid())
@@ -469,6 +470,33 @@ def test_a_build_that_is_missing_or_older_than_the_dataflow(project: Path) -> No
     os.utime(session, (500, 500))
     (note,) = plan_of(project, uv=True).notes
     assert note.endswith(f"newer than its last build; to build again: doractl build --uv {flow}")
+
+
+def test_a_virtual_environment_that_leads_nowhere(project: Path) -> None:
+    """It is refused by name: without it nodes would run with another Python."""
+    venv = project / ".venv"
+    venv.joinpath("bin").mkdir(parents=True)
+    (venv / "pyvenv.cfg").touch()
+    (venv / "bin/python").symlink_to("/nowhere/python3.11")
+    with pytest.raises(DoraSystemdError, match=r"python3\.11, does not exist$") as caught:
+        plan_of(project)
+    assert caught.value.hint.startswith(f"remove {venv} and make it again, by uv sync")
+    with pytest.raises(DoraSystemdError, match=r"python3\.11, does not exist$"):
+        plan_of(project, venv=str(venv))
+    make_program(project / "other/bin/python")
+    other = {"VIRTUAL_ENV": f"{project}/other"}
+    assert plan_of(project, other).options.venv == f"{project}/other"
+
+
+def test_nodes_with_another_dora(project: Path) -> None:
+    make_program(project / ".venv/bin/python")
+    install(project / ".venv", "dora_rs", "1.0.1")
+    install(project, "dora_rs_cli", "1.1.0")
+    (warning,) = plan_of(project).warnings
+    assert warning.startswith("the nodes' dora is 1.0.1, the daemon is 1.1.0: ")
+    (project / "robot.yml").write_text("nodes: [{id: a, path: a}]\n")
+    (project / "a").touch()
+    assert plan_of(project).warnings == ()  # a program, which may be in Rust
 
 
 def test_a_project_that_uv_has_not_built(project: Path) -> None:

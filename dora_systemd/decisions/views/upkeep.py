@@ -1,0 +1,52 @@
+"""What else happens to a machine: core dumps, and upgrades that reboot it. Pure."""
+
+import re
+from collections.abc import Iterator
+
+from dora_systemd.decisions.views.findings import Finding, State
+
+_COREDUMP = re.compile(r"\|\S*/systemd-coredump(?:\s|$)")
+_APPORT = re.compile(r"\|\S*/apport(?:\s|$)")
+_INSTALL = "as root: apt install systemd-coredump"
+_COMMENT = re.compile(r"""("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/|^[ \t]*#[^\n]*""", re.S | re.M)
+_REBOOT = re.compile(r"Unattended-Upgrade::Automatic-Reboot(-Time)?\s*\"([^\"]*)\"\s*;", re.I)
+_PERIODIC = re.compile(r"APT::Periodic::Unattended-Upgrade\s*\"([^\"]*)\"\s*;", re.I)
+_BLOCKS = re.compile(r"Unattended-Upgrade\s*\{([^{}]*)\}\s*;?", re.I)
+_YES = ("1", "true", "yes", "on", "enable", "with")
+_ANY_TIME = "now"
+
+
+def judge_core_pattern(pattern: str) -> Finding:
+    """Say whether `coredumpctl` shows a crash of a node. pattern: see kernel.core_pattern."""
+    pattern = pattern.strip()
+    if _COREDUMP.match(pattern):
+        return Finding("core dumps", State.OK, "coredumpctl shows crashes of nodes")
+    if _APPORT.match(pattern):
+        text = "apport takes the core dumps of nodes, and discards those of programs of no package"
+        remedy = f"{_INSTALL}; systemctl disable --now apport"
+        return Finding("core dumps", State.NOTE, text, remedy)
+    where = f"kernel.core_pattern is {pattern}" if pattern else "kernel.core_pattern is empty"
+    text = f"a node that crashes leaves no core dump for coredumpctl: {where}"
+    return Finding("core dumps", State.NOTE, text, _INSTALL)
+
+
+def judge_reboots(config: str) -> Iterator[Finding]:
+    """Warn of unattended upgrades that reboot the machine. config: of apt, in its order."""
+    text = _COMMENT.sub(lambda found: found[1] or "", config)
+    text = _BLOCKS.sub(_unfolded, text)
+    periodic = _PERIODIC.findall(text)
+    found = {"": "", "-Time": _ANY_TIME} | {
+        key.title(): value for key, value in _REBOOT.findall(text)
+    }
+    if not periodic or periodic[-1] in ("", "0") or found[""].lower() not in _YES:
+        return
+    when = found["-Time"]
+    at = "as soon as they are done" if when == _ANY_TIME else f"at {when[:8]}"
+    text = f"unattended upgrades may reboot this machine {at}, whatever runs"
+    remedy = 'as root: set Unattended-Upgrade::Automatic-Reboot "false"; in the last file of '
+    yield Finding("upgrades", State.WARNING, text, f"{remedy}/etc/apt/apt.conf.d")
+
+
+def _unfolded(block: re.Match[str]) -> str:
+    """Write `Unattended-Upgrade { KEY "VALUE"; };` with a full name for each key."""
+    return re.sub(r"(^|;)\s*(?=[A-Za-z])", r"\1 Unattended-Upgrade::", block[1].strip())

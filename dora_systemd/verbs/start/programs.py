@@ -1,0 +1,149 @@
+"""Checks before a start that the user of the nodes can execute Python and dora, and their versions.
+
+Virtual environments link to a Python that may be anywhere: below /root, where uv puts it for root,
+in another user's home, or on the machine that the project was copied from.
+"""
+
+import os
+import pwd
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path, PurePath
+
+from dora_systemd.adapters.dora.command import OLDEST_DORA, version_numbers
+from dora_systemd.decisions.cell.programs import (
+    elf_machine,
+    is_for,
+    python_directories,
+    script_interpreter,
+    wheel_version,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.sight import Sight
+from dora_systemd.values import shown
+
+_PACKAGE = "/usr/lib/dora-cli/"
+"""Where the package dora-cli has what its wheel says of itself."""
+_BINFMT = Path("/proc/sys/fs/binfmt_misc")
+_OWN_FILES = {"register", "status"}
+
+
+def check_program(
+    path: str, sight: Sight, user: pwd.struct_passwd | None, here: str = "", depth: int = 1
+) -> None:
+    """Raise DoraSystemdError if the user of the nodes cannot execute a program, or its interpreter.
+
+    user: None for the caller. here: the machine, as in uname(1); "" for this one. depth: how many
+    interpreters are followed.
+    """
+    who = "you" if user is None else f"user {user.pw_name}"
+    if not sight.is_program(path):
+        raise _unusable(path, sight, who)
+    with suppress(OSError):  # an executable that is not readable
+        head = sight.head(path)
+        _check_machine(path, sight.real(path), head, here)
+        if depth and (interpreter := script_interpreter(head)):
+            check_program(interpreter, sight, user, here, depth - 1)
+
+
+def _check_machine(path: str, real: str, head: bytes, here: str) -> None:
+    machine, this = elf_machine(head), here or os.uname().machine
+    if is_for(machine, this) or (not here and _has_emulators()):
+        return
+    reason = f"{_leads(path, real)} is a program for {machine}, and this machine is {this}"
+    hint = f"{_again(path)} on this machine"
+    raise DoraSystemdError(f"cannot use {shown(path)}: {reason}", hint, ExitCode.BAD_INPUT)
+
+
+def _has_emulators() -> bool:
+    """Whether the kernel may execute programs of other machines, see binfmt_misc of Linux."""
+    try:
+        return any(one.name not in _OWN_FILES for one in _BINFMT.iterdir())
+    except OSError:
+        return False
+
+
+def _unusable(path: str, sight: Sight, who: str) -> DoraSystemdError:
+    """Say why a program cannot be executed."""
+    real = sight.real(path)
+    leads = _leads(path, real)
+    code = ExitCode.NO_PERMISSION
+    if sight.exists(real):
+        reason, hint = f"{who} cannot execute {leads}", f"chmod a+x {shown(real)}"
+    elif _is_gone(real, sight):
+        reason, code = f"{leads} does not exist", ExitCode.BAD_INPUT
+        hint = _again(path)
+    else:
+        reason = f"{leads} is behind {shown(_barrier(real, sight))}, which {who} cannot enter"
+        hint = f"{_again(path)} with a Python that all can execute, such as /usr/bin/python3; "
+        hint += "uv puts its own where UV_PYTHON_INSTALL_DIR says, such as /opt/uv/python"
+    return DoraSystemdError(f"cannot use {shown(path)}: {reason}", hint, code)
+
+
+def _leads(path: str, real: str) -> str:
+    """Name the program that a path leads to, in a sentence about that path."""
+    return "it" if path == real else f"the program that it leads to, {shown(real)},"
+
+
+def _again(path: str) -> str:
+    """Tell how to make a virtual environment again. path: of a program in it."""
+    place = PurePath(path).parent
+    if place.name != "bin":
+        return "install it"
+    return f"remove {shown(str(place.parent))} and make it again, by uv sync or python3 -m venv,"
+
+
+def _is_gone(path: str, sight: Sight) -> bool:
+    try:
+        sight.head(path)
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _barrier(path: str, sight: Sight) -> str:
+    """The last directory on the way to `path` that the account sees; it cannot enter that one."""
+    parents = (str(one) for one in PurePath(path).parents)
+    return next((one for one in parents if sight.exists(one)), "/")
+
+
+def nodes_dora(venv: str, sight: Sight) -> str:
+    """The version of dora that Python nodes of a virtual environment import, or ""."""
+    return _wheel(venv, "dora_rs", sight)
+
+
+def daemon_dora(dora: str, sight: Sight) -> str:
+    """The version of a dora command, without running it, or ""."""
+    places = (str(PurePath(one).parent.parent) for one in (dora, sight.real(dora)))
+    found = (_wheel(one, "dora_rs_cli", sight) for one in places)
+    own = "dora_rs_cli"
+    package = wheel_version(sight.names(_PACKAGE + own), own) if dora == "/usr/bin/dora" else ""
+    return next(filter(None, found), package)
+
+
+def _wheel(prefix: str, wheel: str, sight: Sight) -> str:
+    for one in python_directories(sight.names(f"{prefix}/lib/python3.")):
+        names = sight.names(f"{prefix}/lib/{one}/site-packages/{wheel}-")
+        if version := wheel_version(names, wheel):
+            return version
+    return ""
+
+
+def version_warnings(venv: str | None, dora: str, sight: Sight) -> Iterator[str]:
+    """Warn of Python nodes whose dora has another version than the daemon.
+
+    venv: of the nodes. Raises DoraSystemdError (BAD_INPUT) for one that no daemon takes.
+    """
+    version = nodes_dora(venv, sight) if venv else ""
+    if not version:
+        return
+    remedy = f"{venv}/bin/python -m pip install dora-rs"
+    if version_numbers(version) < OLDEST_DORA:
+        message = f"cannot start nodes with the Python of {shown(venv or '')}: their dora is "
+        message += f"{version}, 1.0 or newer is needed"
+        raise DoraSystemdError(message, f"{remedy} --upgrade", ExitCode.BAD_INPUT)
+    daemon = daemon_dora(dora, sight)
+    if daemon and daemon != version:
+        yield f"the nodes' dora is {version}, the daemon is {daemon}: {remedy}=={daemon}"

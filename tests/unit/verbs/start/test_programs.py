@@ -1,0 +1,152 @@
+"""Pythons and doras that the user of the nodes cannot execute, and those of another version."""
+
+import errno
+import os
+import pwd
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.sight import Sight
+from dora_systemd.verbs.start.programs import check_program, daemon_dora, version_warnings
+from tests.unit.decisions.cell.test_programs import elf
+from tests.unit.fakes.programs import make_program
+
+ALICE: Any = pwd.struct_passwd(("alice", "x", 1000, 1000, "", "/home/alice", "/bin/sh"))
+PYTHON = elf(62)
+VENV = "/srv/x/.venv/bin/python"
+
+
+@dataclass
+class Disk(Sight):
+    """What an account sees. links: targets by path. closed: directories that it cannot enter."""
+
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    links: Mapping[str, str] = field(default_factory=dict)
+    closed: tuple[str, ...] = ()
+
+    def _ask(self, letter: bytes, path: str) -> bytes:
+        for _ in range(9):
+            path = self.links.get(path, path)
+        if letter == b"l":
+            return os.fsencode(path)
+        if {*map(str, PurePath(path).parents)} & {*self.closed}:
+            raise OSError(errno.EACCES, "")
+        directories = {str(one) for file in self.files for one in PurePath(file).parents}
+        if path not in (*self.files, *directories, *self.closed):
+            raise OSError(errno.ENOENT, "")
+        return self.files.get(path, b"") if letter == b"h" else b"1"
+
+
+@dataclass
+class Layout:
+    """A Python of nodes. message, hint: of the refusal, if it is refused."""
+
+    disk: Disk
+    message: str = ""
+    hint: str = ""
+    python: str = VENV
+
+
+REAL = "/usr/bin/python3.13"
+CONDA = "/opt/conda/envs/x/bin/python"
+LAYOUTS = {
+    "the system's Python": Layout(Disk({REAL: PYTHON}), python=REAL),
+    "a .venv beside the file": Layout(Disk({REAL: PYTHON}, {VENV: REAL})),
+    "uv's Python below /root": Layout(
+        Disk({}, {VENV: "/root/.local/share/uv/python/3.13/bin/python3.13"}, ("/root",)),
+        f"cannot use {VENV}: the program that it leads to, /root/.local/share/uv/python/3.13/bin/"
+        "python3.13, is behind /root, which user alice cannot enter",
+        "UV_PYTHON_INSTALL_DIR says, such as /opt/uv/python",
+    ),
+    "a Python in another user's home": Layout(
+        Disk({}, {VENV: "/home/bob/py/bin/python3"}, ("/home/bob",)),
+        "is behind /home/bob, which user alice cannot enter",
+        "with a Python that all can execute",
+    ),
+    "pyenv in the own home": Layout(
+        Disk(
+            {"/home/alice/.pyenv/versions/3.13/bin/python3": PYTHON},
+            {VENV: REAL, REAL: ("/home/alice/.pyenv/versions/3.13/bin/python3")},
+        ),
+    ),
+    "a shim of pyenv": Layout(
+        Disk({"/home/alice/.pyenv/shims/python": b"#!/bin/bash\n", "/bin/bash": PYTHON}),
+        python="/home/alice/.pyenv/shims/python",
+    ),
+    "conda": Layout(Disk({CONDA: PYTHON}), python=CONDA),
+    "a base that was removed": Layout(
+        Disk({"/srv/x/.venv/pyvenv.cfg": b""}, {VENV: "/opt/old/bin/python3.11"}),
+        f"cannot use {VENV}: the program that it leads to, /opt/old/bin/python3.11, does not exist",
+        "remove /srv/x/.venv and make it again",
+    ),
+    "another machine's": Layout(
+        Disk({REAL: elf(183)}, {VENV: REAL}),
+        "/usr/bin/python3.13, is a program for aarch64, and this machine is x86_64",
+        "make it again, by uv sync or python3 -m venv, on this machine",
+    ),
+    "a script whose interpreter is gone": Layout(
+        Disk({"/srv/x/.venv/bin/dora": b"#!/srv/x/.venv/bin/python\n"}, {VENV: "/opt/old/python"}),
+        "/opt/old/python, does not exist",
+        python="/srv/x/.venv/bin/dora",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layouts_of_interpreters(name: str) -> None:
+    layout = LAYOUTS[name]
+    if not layout.message:
+        check_program(layout.python, layout.disk, ALICE, "x86_64")
+        return
+    with pytest.raises(DoraSystemdError) as caught:
+        check_program(layout.python, layout.disk, ALICE, "x86_64")
+    assert layout.message in caught.value.message
+    assert layout.hint in caught.value.hint
+
+
+def test_a_program_without_the_permission(tmp_path: Path) -> None:
+    """As the caller, with real files."""
+    path = tmp_path / "python"
+    make_program(path)
+    check_program(str(path), Sight(), None)
+    path.chmod(0o644)
+    with pytest.raises(DoraSystemdError, match=f"cannot use {path}: you cannot execute it$"):
+        check_program(str(path), Sight(), None)
+
+
+def install(prefix: Path, wheel: str, version: str, python: str = "python3.13") -> str:
+    """A wheel in a prefix, which it returns."""
+    (prefix / f"lib/{python}/site-packages/{wheel}-{version}.dist-info").mkdir(parents=True)
+    return str(prefix)
+
+
+def test_versions_of_nodes_and_daemon(tmp_path: Path) -> None:
+    venv, other = install(tmp_path / "v", "dora_rs", "1.0.1"), tmp_path / "dora"
+    install(other, "dora_rs_cli", "1.1.0", "python3.11")
+    dora, sight = f"{other}/bin/dora", Sight()
+    (warning,) = version_warnings(venv, dora, sight)
+    expected = f"the nodes' dora is 1.0.1, the daemon is 1.1.0: {venv}/bin/python -m pip install "
+    assert warning == f"{expected}dora-rs==1.1.0"
+    assert not list(version_warnings(None, dora, sight))
+    assert not list(version_warnings(venv, str(tmp_path / "nowhere/dora"), sight))
+    assert not list(version_warnings(install(tmp_path / "w", "dora_rs", "1.1.0"), dora, sight))
+
+
+def test_nodes_that_no_daemon_takes(tmp_path: Path) -> None:
+    """dora 0.5 cannot read the configuration that a daemon of dora 1 gives its nodes."""
+    venv = install(tmp_path, "dora_rs", "0.5.0")
+    with pytest.raises(DoraSystemdError, match=r"their dora is 0\.5\.0, 1\.0 or newer") as caught:
+        list(version_warnings(venv, "/nowhere/dora", Sight()))
+    assert caught.value.code is ExitCode.BAD_INPUT
+
+
+def test_a_dora_behind_a_link(tmp_path: Path) -> None:
+    install(tmp_path / "tool", "dora_rs_cli", "1.1.0")
+    make_program(tmp_path / "tool/bin/dora")
+    (tmp_path / "dora").symlink_to("tool/bin/dora")
+    assert daemon_dora(str(tmp_path / "dora"), Sight()) == "1.1.0"
