@@ -158,7 +158,9 @@ class Pump:
         elif record.node:
             self._nodes.drain([record.node], is_live=record.event not in NODE_END_EVENTS)
         elif record.event == "dataflow-stopping":
-            notify.send_stopping()
+            if self._is_ready:
+                # Else READY=1 comes at the end, which systemd 262 refuses after this.
+                notify.send_stopping()
             fd_store.forget_lives()  # a restart that a person asks for has no delay
 
     async def wait(self, is_so: Callable[[Cell], bool], seconds: float | None) -> bool:

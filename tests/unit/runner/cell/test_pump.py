@@ -205,6 +205,24 @@ def test_systemd_is_told_each_state_once(tmp_path: Path, monkeypatch: pytest.Mon
         live(work)
 
 
+def test_a_stop_before_it_is_ready_ends_as_a_start_that_went_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Systemd refuses READY=1 after STOPPING=1, from version 262 on with a warning."""
+    told = hear_notifications(monkeypatch)
+
+    async def work() -> None:
+        monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere")
+        bench = Bench(tmp_path, State.WAITING, ready_us=0)
+        bench.push(life.StopAsked(8, "SIGTERM"), life.StopAnswered(9))
+        bench.push(life.ChildExited(10, "daemon", exit_of(0)))
+        assert bench.pump.cell.state is State.ENDED
+        assert "READY=1" in told
+        assert "STOPPING=1" not in told
+
+    live(work)
+
+
 def test_the_table_is_there_before_anybody_hears_that_it_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
