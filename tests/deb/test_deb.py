@@ -43,32 +43,33 @@ def flows() -> Iterator[dict[str, Path]]:
             sh("command -v doractl >/dev/null && doractl stop --all || :", user)
 
 
-def main_pid(user: str) -> str:
+def main_pid(user: str, name: str = "robot") -> str:
     flag = "--system" if user == "root" else "--user"
-    script = f"{ALICE} systemctl {flag} show --value --property=MainPID dora-robot"
+    script = f"{ALICE} systemctl {flag} show --value --property=MainPID dora-{name}"
     return sh(script, user).stdout.strip()
 
 
-def all_pids(user: str) -> list[str]:
+def all_pids(user: str, name: str = "robot") -> list[str]:
     """Every process of the robot."""
     flag = "--system" if user == "root" else "--user"
-    script = f"{ALICE} systemctl {flag} show --value --property=ControlGroup dora-robot"
+    script = f"{ALICE} systemctl {flag} show --value --property=ControlGroup dora-{name}"
     group = Path(f"/sys/fs/cgroup{sh(script, user).stdout.strip()}")
     return sorted(pid for path in group.rglob("cgroup.procs") for pid in path.read_text().split())
 
 
-def uuid(user: str) -> str:
-    (row,) = json.loads(sh("doractl list -o json", user).stdout)
+def uuid(user: str, name: str = "robot") -> str:
+    rows = json.loads(sh("doractl list -o json", user).stdout)
+    (row,) = (row for row in rows if row["name"] == name)
     return str(row["uuid"])
 
 
-def lines(user: str, node: str) -> list[str]:
-    return sh(f"doractl logs robot --node {node} -o cat", user, check=False).stdout.splitlines()
+def lines(user: str, node: str, name: str = "robot") -> list[str]:
+    return sh(f"doractl logs {name} --node {node} -o cat", user, check=False).stdout.splitlines()
 
 
-def wait_for_plot(user: str, seen: int = 0) -> None:
+def wait_for_plot(user: str, seen: int = 0, name: str = "robot") -> None:
     try:
-        wait_for(f"{user}'s robot plots", lambda: len(lines(user, "plot")) > seen, 120)
+        wait_for(f"{user}'s {name} plots", lambda: len(lines(user, "plot", name)) > seen, 120)
     except AssertionError as error:
         raise AssertionError(f"{error}, after {seen} lines\n{last_words(user)}") from None
 
@@ -172,22 +173,26 @@ def test_shells_complete_nodes_that_run(shell: str, user: str) -> None:
     assert found == ["detector"]
 
 
-def test_upgrade_keeps_dataflows_running(tmp_path: Path) -> None:
-    """What runs is not touched, and what is installed then works with it."""
+def test_upgrade_keeps_dataflows_running(tmp_path: Path, flows: dict[str, Path]) -> None:
+    """What runs is not touched, enabled or deployed, and what is installed then works with it."""
     this = packages.version()
     packages.install(packages.build_previous(tmp_path))
     assert packages.version() == f"{this}~previous"
-    for user in USERS:
-        sh("doractl restart robot", user)
-    before = {user: (all_pids(user), uuid(user)) for user in USERS}
+    sh("doractl enable robot && doractl restart robot")
+    sh("doractl restart robot", "alice")
+    sh(f"doractl deploy {flows['alice']} --name released --soak 0s", "alice")
+    cells = [("root", "robot"), ("alice", "robot"), ("alice", "released")]
+    before = {cell: (all_pids(*cell), uuid(*cell)) for cell in cells}
     packages.install()
     assert packages.version() == this
-    assert {user: (all_pids(user), uuid(user)) for user in USERS} == before
-    for user in USERS:
-        wait_for_plot(user, len(lines(user, "plot")))
-        sh("doractl node restart robot detector", user)
-        wait_for_plot(user, len(lines(user, "plot")))
-        assert main_pid(user) in before[user][0]
+    assert {cell: (all_pids(*cell), uuid(*cell)) for cell in cells} == before
+    for user, name in cells:
+        wait_for_plot(user, len(lines(user, "plot", name)), name)
+        sh(f"doractl node restart {name} detector", user)
+        wait_for_plot(user, len(lines(user, "plot", name)), name)
+        assert main_pid(user, name) in before[user, name][0]
+    sh("doractl restart robot && doractl disable robot")
+    sh("doractl disable released && doractl stop released", "alice")
 
 
 def test_stop_and_start_after_that(flows: dict[str, Path]) -> None:
