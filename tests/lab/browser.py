@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from lab import definition
-from lab.cache import Layer, ensure, ensure_locked
+from lab.cache import Layer, ensure
 from lab.errors import Stage
 from lab.image import CERTIFICATES, add_dora_user, base_layer, install_checkout, run_in_tree
 from lab.process import run_logged
@@ -25,7 +25,7 @@ def chromium_layer(cache: Path) -> Layer:
 
 def build_chromium(path: Path, cache: Path) -> None:
     """A copy, not links: apt writes into files that it finds."""
-    base = ensure_locked(cache, base_layer(cache))
+    base = ensure(cache, base_layer(cache))
     log = cache / "browser.log"
     log.unlink(missing_ok=True)
     path.rmdir()
@@ -37,7 +37,7 @@ def build_chromium(path: Path, cache: Path) -> None:
 
 
 def build_browser(path: Path, cache: Path) -> None:
-    chromium = ensure_locked(cache, chromium_layer(cache))
+    chromium = ensure(cache, chromium_layer(cache))
     log = cache / "browser.log"
     path.rmdir()
     with Stage("editable install of the checkout"):

@@ -9,7 +9,7 @@ import shutil
 from pathlib import Path
 
 from lab import definition
-from lab.cache import Layer, ensure, ensure_locked, find_cache
+from lab.cache import Layer, ensure, find_cache
 from lab.image import copy_checkout, tree_environment, tree_layer
 from lab.process import run_logged
 
@@ -50,7 +50,7 @@ def _key() -> str:
 
 def _build(path: Path, cache: Path) -> None:
     """Without a word: it takes two seconds after each change."""
-    tree, log = ensure_locked(cache, tree_layer(cache)), cache / "bytecode.log"
+    tree, log = ensure(cache, tree_layer(cache)), cache / "bytecode.log"
     (path / "src").mkdir()
     copy_checkout(path / "src")
     # In a mount namespace of its own: nothing to unmount, whatever happens.

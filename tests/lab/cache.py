@@ -64,25 +64,25 @@ def ensure(cache: Path, layer: Layer) -> Path:
 
 
 def build_alone(cache: Path, layer: Layer) -> None:
-    lock = try_lock(cache / "build.lock")
+    """Build it, or wait until another process has. Layers of other kinds are built meanwhile.
+
+    A layer that is made of others has `ensure()` build them: no two kinds need each other.
+    """
+    path = cache / f"{layer.kind}.build.lock"
+    lock = try_lock(path)
     if lock is None:
-        say("another build is running, waiting for it ...")
-        lock = take_lock(cache / "build.lock", fcntl.LOCK_EX)
+        say(f"another build of this is running, waiting for it: {layer.kind} ...")
+        lock = take_lock(path, fcntl.LOCK_EX)
     try:
-        remove_unfinished(cache)
-        ensure_locked(cache, layer)
+        if not (cache / layer.name).exists():
+            build_layer(cache, layer)
     finally:
         os.close(lock)
 
 
-def ensure_locked(cache: Path, layer: Layer) -> Path:
-    """For whoever holds the build lock: the layers a layer is made of."""
-    if not (cache / layer.name).exists():
-        build_layer(cache, layer)
-    return cache / layer.name
-
-
 def build_layer(cache: Path, layer: Layer) -> None:
+    for left in cache.glob(f"{layer.kind}-*.tmp"):  # by a build that was killed
+        shutil.rmtree(left)
     unfinished = cache / f"{layer.name}.tmp"
     unfinished.mkdir()
     layer.build(unfinished)
@@ -90,12 +90,6 @@ def build_layer(cache: Path, layer: Layer) -> None:
     unfinished.rename(cache / layer.name)
     for old in find_old(cache, layer):
         remove_layer(old)
-
-
-def remove_unfinished(cache: Path) -> None:
-    """Called under the build lock only, so nobody is working on them."""
-    for path in cache.glob("*.tmp"):
-        shutil.rmtree(path)
 
 
 def find_old(cache: Path, layer: Layer) -> list[Path]:

@@ -5,7 +5,7 @@ import subprocess
 from pathlib import Path
 
 from lab import definition
-from lab.cache import Layer, ensure_locked
+from lab.cache import Layer, ensure
 from lab.errors import Stage
 from lab.image import base_layer, unpacked_layer
 from lab.process import run_logged
@@ -51,11 +51,11 @@ def kernel_layer(cache: Path) -> Layer:
 
 
 def build_disk(path: Path, cache: Path) -> None:
-    base = ensure_locked(cache, base_layer(cache))
-    kernel = ensure_locked(cache, kernel_layer(cache))
+    base = ensure(cache, base_layer(cache))
+    kernel = ensure(cache, kernel_layer(cache))
     with Stage("disk of the machine"):
         write_extras(path / "extras", kernel)
-        write_disk(path, base, cache / "build.log")
+        write_disk(path, base, cache / "disk.log")
 
 
 def write_extras(path: Path, kernel: Path) -> None:

@@ -6,7 +6,7 @@ import subprocess
 from pathlib import Path
 
 from lab import definition
-from lab.cache import Layer, ensure, ensure_locked
+from lab.cache import Layer, ensure
 from lab.errors import LabError, Stage
 from lab.process import need_tools, run_logged
 
@@ -31,7 +31,7 @@ def ensure_tree(cache: Path) -> Path:
 
 
 def base_layer(cache: Path) -> Layer:
-    return Layer("base", definition.base_key(), lambda path: build_base(path, cache / "build.log"))
+    return Layer("base", definition.base_key(), lambda path: build_base(path, cache / "base.log"))
 
 
 def tree_layer(cache: Path) -> Layer:
@@ -78,15 +78,15 @@ def unpacked_layer(
     def build(path: Path) -> None:
         with Stage(f"{kind}: {', '.join(packages)} of Debian {suite}"):
             command = debian_command(path, "extract", packages, suite)
-            run_logged(command, cache / "build.log", f"download {packages[0]}")
+            run_logged(command, cache / f"{kind}.log", f"download {packages[0]}")
 
     return Layer(kind, definition.digest(suite, packages), build)
 
 
 def build_tree(path: Path, cache: Path) -> None:
     """A copy of the base by hard links: pip and useradd replace files, they do not rewrite them."""
-    base = ensure_locked(cache, base_layer(cache))
-    log = cache / "build.log"
+    base = ensure(cache, base_layer(cache))
+    log = cache / "tree.log"
     with Stage("editable install of the checkout"):
         path.rmdir()
         run_logged(["cp", "--archive", "--link", str(base), str(path)], log, "copy the base")

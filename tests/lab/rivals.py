@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from lab import definition
-from lab.cache import Layer, ensure, ensure_locked
+from lab.cache import Layer, ensure
 from lab.errors import Stage
 from lab.image import (
     CERTIFICATES,
@@ -32,7 +32,7 @@ def ensure_rivals(cache: Path) -> Path:
 
 def build(path: Path, cache: Path) -> None:
     """A copy, not links: apt writes into files that it finds."""
-    base = ensure_locked(cache, base_layer(cache))
+    base = ensure(cache, base_layer(cache))
     log = cache / "rivals.log"
     log.unlink(missing_ok=True)
     path.rmdir()

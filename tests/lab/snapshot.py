@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lab import definition, qemu
-from lab.cache import Layer, ensure, ensure_locked, find_cache
+from lab.cache import Layer, ensure, find_cache
 from lab.disk import NAME, disk_layer, kernel_layer
 from lab.emulator import emulator_layer, program
 from lab.errors import LabError, Stage
@@ -49,12 +49,12 @@ def find_emulator() -> Path:
 
 
 def build_snapshot(path: Path, cache: Path) -> None:
-    kernel = ensure_locked(cache, kernel_layer(cache))
-    disk = ensure_locked(cache, disk_layer(cache))
+    kernel = ensure(cache, kernel_layer(cache))
+    disk = ensure(cache, disk_layer(cache))
     shutil.copy(next(kernel.glob("boot/vmlinuz-*")), path / "vmlinuz")
     write_initrd(kernel, path / "initrd")
     with Stage("first boot and snapshot of the emulated machine"):
-        write_snapshot(path, disk, cache / "build.log")
+        write_snapshot(path, disk, cache / "snapshot.log")
 
 
 def write_snapshot(path: Path, below: Path, log: Path) -> None:
