@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.properties.sandbox import Sandbox
 from dora_systemd.decisions.settings.resolve import Settings
@@ -77,7 +76,7 @@ def make_plan(scope: Scope, request: StartRequest, read: Files | None = None) ->
         check_credentials(scope, credential_files(settings))
         launch, missing = check_startable(where, sight, dataflow, request.is_unbuilt)
         warnings = () if request.is_unbuilt else tuple(start_warnings(where, dataflow, sight))
-        notes = tuple(plan_notes(scope, settings, dataflow, launch, sight))
-        sandbox = make_sandbox(scope, settings, user, Prepared(dataflow, launch, {}), sight)
+        notes = tuple(plan_notes(scope, look, dataflow, launch))
+        sandbox = make_sandbox(scope, look, dataflow, launch)
     facts = (scope, where.options, settings, user, where.environment)
     return Plan(*facts, sandbox, warnings, notes, where.members, missing)

@@ -6,13 +6,14 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
+from dora_systemd.adapters.dora.preparation import PACKAGE
 from dora_systemd.adapters.host.files import absolute_path
-from dora_systemd.decisions.cell.launch import python_of
+from dora_systemd.decisions.cell.launch import LaunchPlan, python_of
 from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import has_process_rights
 from dora_systemd.decisions.cell.uv import uv_project
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.needs.units import device_entries
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
@@ -26,6 +27,7 @@ from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sight import Sight
 from dora_systemd.values import shown
 from dora_systemd.verbs.facts.nodes import named_places
+from dora_systemd.verbs.start.where import Look
 
 _MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")
 _IDENTITY = 65536
@@ -36,23 +38,20 @@ _UV_PLACES = (".cache/uv", ".local/share/uv")
 
 def make_sandbox(
     scope: Scope,
-    settings: Settings,
-    user: pwd.struct_passwd | None,
-    prepared: Prepared,
-    sight: Sight | None = None,
+    look: Look,
+    dataflow: Dataflow,
+    launch: LaunchPlan,
     offers_identity: bool | None = None,
 ) -> Sandbox:
     """The sandbox of the settings. Raises DoraSystemdError for a path that does not exist.
 
-    user: of the nodes, None in user scope. sight: that of this user; None: the caller's.
     offers_identity: whether the machine can create a user namespace; None: ask it.
     """
-    sight = sight or Sight()
-    options = prepared.plan.options
+    sight, settings, user, options = look.sight, look.settings, look.user, launch.options
     rights = options.node_rights
     given = [_checked(path, sight, user) for path in settings[WRITABLE]]
     denied = [] if user is None else [path for path in given if not sight.is_writable(path)]
-    needed = tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight)))
+    needed = tuple(dict.fromkeys(_existing(_needed(dataflow, launch, sight), sight)))
     writable = (*given, *_existing(_written_by_uv(options, user, sight), sight))
     return Sandbox(
         level=settings[SANDBOX],
@@ -153,17 +152,16 @@ def _existing(paths: Iterator[Path], sight: Sight) -> Iterator[str]:
     yield from (absolute_path(str(path)) for path in paths if sight.exists(str(path)))
 
 
-def _needed(prepared: Prepared, sight: Sight) -> Iterator[Path]:
+def _needed(dataflow: Dataflow, launch: LaunchPlan, sight: Sight) -> Iterator[Path]:
     """The paths of the dataflow, its programs, their interpreters, and this package."""
-    options = prepared.plan.options
+    options, session = launch.options, launch.session
     yield Path(options.dataflow).parent
     yield Path(options.working_directory)
     yield from (Path(sys.prefix), Path(sys.base_prefix), PACKAGE.parent)
-    for program in (options.dora, python_of(prepared.plan)):
+    for program in (options.dora, python_of(launch)):
         # A virtual environment links to the Python that it was created from.
         yield from (_prefix(Path(program)), _prefix(Path(sight.real(program))))
-    yield from named_places(prepared.dataflow, sight)
-    session = prepared.plan.session
+    yield from named_places(dataflow, sight)
     yield from map(Path, (*session.directories.values(), *session.envs.values()))
 
 

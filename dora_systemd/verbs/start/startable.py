@@ -27,7 +27,7 @@ from dora_systemd.trust.paths import reached
 from dora_systemd.trust.sight import Sight
 from dora_systemd.values import shown
 from dora_systemd.verbs.start.programs import version_warnings
-from dora_systemd.verbs.start.where import Where
+from dora_systemd.verbs.start.where import Look, Where
 
 
 def check_startable(
@@ -62,13 +62,11 @@ def _read_session(dataflow: str, sight: Sight) -> BuildSession:
     return parse_session(parse_yaml(text, path, allow_empty=True))
 
 
-def plan_notes(
-    scope: Scope, settings: Settings, dataflow: Dataflow, launch: LaunchPlan, sight: Sight
-) -> Iterator[str]:
+def plan_notes(scope: Scope, look: Look, dataflow: Dataflow, launch: LaunchPlan) -> Iterator[str]:
     """A line for each thing to know or to do."""
     dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
     # No other process can reach the ports of a private network.
-    if dynamic and settings[NETWORK] != "private":
+    if dynamic and look.settings[NETWORK] != "private":
         nodes = f"node{'s' if len(dynamic) > 1 else ''} {', '.join(dynamic)}"
         variables = f'eval "$(doractl {scope.flag} env {launch.options.name})"'
         yield f"start the dynamic {nodes} in another terminal, after: {variables}"
@@ -78,7 +76,7 @@ def plan_notes(
     # `dora run` always builds first.
     if not launch.session.directories:
         yield f"no build of {path} is found; to build it: doractl build {uv}{path}"
-    elif _is_build_old(dataflow, sight):
+    elif _is_build_old(dataflow, look.sight):
         yield f"{path} is newer than its last build; to build again: doractl build {uv}{path}"
 
 

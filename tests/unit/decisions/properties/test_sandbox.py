@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host.files import absolute_path
 from dora_systemd.decisions.cell.launch import LaunchPlan
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
@@ -23,6 +22,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.sight import Sight
 from dora_systemd.verbs.start.sandbox import _maps_identity, make_sandbox, sandbox_warnings
+from dora_systemd.verbs.start.where import Look
 from tests.unit.fakes.manager import options
 
 places = st.sampled_from(
@@ -279,9 +279,9 @@ def made(
     )
     document = {"nodes": [{"id": "a", "path": nodes, "outputs": ["x"]}]}
     plan = LaunchPlan(own, "/l.sh", "/nowhere", os.path.exists, Sight().read)
-    prepared = Prepared(parse_dataflow(document, "flow.yml"), plan, {})
-    settings = resolve_settings(flags, {}, [])
-    return make_sandbox(SYSTEM, settings, user, prepared, sight, offers_identity)
+    dataflow = parse_dataflow(document, "flow.yml")
+    look = Look(sight or Sight(), resolve_settings(flags, {}, []), user, str(tmp_path))
+    return make_sandbox(SYSTEM, look, dataflow, plan, offers_identity)
 
 
 def test_what_a_plan_needs(tmp_path: Path) -> None:
