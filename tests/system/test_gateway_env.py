@@ -21,7 +21,7 @@ def test_of_one_dataflow(cell: Cell, project: Project) -> None:
     assert (refused.returncode, refused.stdout) == (ExitCode.NO_PERMISSION, "")
     cell.systemctl("stop")
     refused = run("doractl", "env", cell.name, check=False)
-    assert (refused.returncode, refused.stdout) == (ExitCode.NOT_FOUND, "")
+    assert (refused.returncode, refused.stdout) == (ExitCode.NOT_RUNNING, "")
 
 
 def test_of_the_gateway(front: Front) -> None:
