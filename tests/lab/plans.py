@@ -55,15 +55,15 @@ def plan_test(form: str) -> list[Step]:
     if form == "host":
         return [*plan_unit(form), *plan_system(form)]
     (unit,) = plan_unit(form)
-    build, inside, several = build_step(), limits_step(), machines_step()
+    build, inside, several = build_step(), limits_step(), machines_steps()
     queue = [replace(one, after=(unit.name,)) for one in plan_system("container")]
-    inside, several = (replace(one, after=(unit.name,)) for one in (inside, several))
+    inside, *several = (replace(one, after=(unit.name,)) for one in (inside, *several))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
     oldest, newest = platform_step(OLD_SUITE, minutes=2), platform_step(NEW_SUITE, "-k", NEW)
     others = [*plan_lab(form), *plan_other_python(form), *plan_emulator(form)]
     lane = [build, packages_step(), wheels_step(), oldest, newest, *others]
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
-    return [unit, several, *in_a_row(lane, unit), inside, restarted, *queue]
+    return [unit, *several, *in_a_row(lane, unit), inside, restarted, *queue]
 
 
 def in_a_row(steps: Sequence[Step], first: Step) -> list[Step]:
@@ -191,11 +191,12 @@ def plan_browser(_form: str) -> list[Step]:
 
 
 def plan_machines(_form: str) -> list[Step]:
-    return [machines_step()]
+    return machines_steps()
 
 
-def machines_step() -> Step:
-    return lab_step("several machines", "machines", ["tests/machines"], minutes=6)
+def machines_steps() -> list[Step]:
+    """Three machines, twice."""
+    return queue_steps("several machines", "machines", ["tests/machines"], 8, 2, "lab")
 
 
 def plan_faults(form: str) -> list[Step]:
@@ -273,8 +274,15 @@ def installed(form: str) -> list[str]:
     return ["tests/platforms/installed"] if form in PLATFORMS else []
 
 
-def queue_steps(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> list[Step]:
-    """Containers at the same time, each of which runs the modules that no other one has taken."""
+def queue_steps(
+    name: str,
+    form: str,
+    arguments: Sequence[str],
+    minutes: int = 0,
+    count: int = CONTAINERS,
+    what: str = "container",
+) -> list[Step]:
+    """Labs at the same time, each of which runs the modules that no other one has taken."""
     given = os.environ.get("LAB_OUT")
     queue = Path(tempfile.mkdtemp(prefix="queue-", dir=given))
     atexit.register(shutil.rmtree, queue, ignore_errors=True)
@@ -283,13 +291,13 @@ def queue_steps(name: str, form: str, arguments: Sequence[str], minutes: int = 0
     run = ["tests/lab/lab", "run", "--", *installed(form)]
     return [
         Step(
-            f"{name}, container {number} of {CONTAINERS}",
+            f"{name}, {what} {number} of {count}",
             [*run, "pytest", f"--queue={place}", *arguments],
             env.copy,
             minutes=minutes,
             after=tuple(one.name for one in packages_for(form)),
         )
-        for number in range(1, CONTAINERS + 1)
+        for number in range(1, count + 1)
     ]
 
 

@@ -5,6 +5,25 @@ from collections.abc import Iterator
 import pytest
 
 from tests.machines import journals
+from tests.machines.flows import GRACE, THREE, TWO, Flow, flow_on
+from tests.system.work_queue import in_order, pytest_addoption, pytest_runtestloop
+
+__all__ = ["pytest_addoption", "pytest_runtestloop"]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    items[:] = in_order(config, items)
+
+
+@pytest.fixture(params=[TWO, THREE], ids=["two", "three"])
+def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
+    """A dataflow that runs, and is started again whatever ends it."""
+    policy = ("--restart-policy=on-failure", "--max-restarts=50", f"--grace-duration={GRACE}s")
+    expected = [*journals.announced(request), *journals.BUSY]
+    with flow_on(Flow(request.param), expected) as flow:
+        flow.start(*policy)
+        flow.wait_exchanging()
+        yield flow
 
 
 @pytest.fixture

@@ -8,8 +8,6 @@ from tests.machines.flows import PLACE, Flow
 from tests.system.cells import Project
 
 ADDRESSES = {"a": "10.77.0.1", "b": "10.77.0.2", "c": "10.77.0.3"}
-TWO = {"gpu": "b"}
-THREE = {"gpu": "b", "arm": "c"}
 
 
 @dataclass(frozen=True)

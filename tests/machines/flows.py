@@ -14,6 +14,10 @@ from tests.system.cells import DOUBLER, SINK, SOURCE, Cell, Project, dora_proces
 
 PLACE = "/opt/flow"
 NAME = "flow"
+TWO = {"gpu": "b"}
+THREE = {"gpu": "b", "arm": "c"}
+"""The machines beside this one, by their names in the settings."""
+GRACE = 2
 _DATAFLOW = """
 nodes:
   - id: source

@@ -18,6 +18,10 @@ LOST = (
     "flow: Machine head of dataflow flow is lost: ",
 )
 """What all say when the head has lost a member."""
+lost = pytest.mark.warns(*LOST)
+killed = pytest.mark.warns(
+    "Main process exited, code=killed, status=9/KILL", "Failed with result 'signal'"
+)
 BUSY = ("node exited with error: Signal(15)", "State 'stop-post' timed out")
 """Of a machine that gives a node too little time within the grace, or systemd's last command."""
 

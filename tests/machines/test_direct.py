@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.machines.direct import ADDRESSES, THREE, TWO, DirectFlow
-from tests.machines.flows import NAME, flow_on
+from tests.machines.direct import ADDRESSES, DirectFlow
+from tests.machines.flows import NAME, THREE, TWO, flow_on
 from tests.machines.journals import BUSY, LOST, announced
 from tests.machines.wires import cable, there
 from tests.system.cells import run, wait_for

@@ -8,13 +8,10 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.machines.flows import NAME, PLACE, Flow, flow_on
+from tests.machines.flows import NAME, PLACE, THREE, TWO, Flow, flow_on
 from tests.machines.journals import announced
 from tests.machines.wires import there, wait_up
 from tests.system.cells import run
-
-TWO = {"gpu": "b"}
-THREE = {"gpu": "b", "arm": "c"}
 
 
 @pytest.fixture(params=[TWO, THREE], ids=["two", "three"])

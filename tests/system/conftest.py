@@ -15,20 +15,12 @@ from tests.system.complaints import complaints, end_of_journal
 from tests.system.gateways import Front
 from tests.system.ports import reserve_ports
 from tests.system.releases import Releases
-from tests.system.work_queue import longest_first, run_queue
+from tests.system.work_queue import in_order, pytest_addoption, pytest_runtestloop
 
-LONGEST = (
-    *("test_fidelity_exit", "test_restarts", "test_history", "test_transcripts"),
-    *("test_faults", "test_gateway", "test_remote"),
-)
-"""Modules that take longest, which a queue begins with."""
+__all__ = ["pytest_addoption", "pytest_runtestloop"]
 
 LONGEST_SECONDS = 300
 """No test takes a tenth of it: one that hangs fails, shows where it stood, and the others run."""
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--queue", type=Path, help="run only modules that no other container takes")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -37,16 +29,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if here in item.path.parents:
             item.add_marker(pytest.mark.system)
             item.add_marker(pytest.mark.timeout(bound(LONGEST_SECONDS)))
-    if config.getoption("--queue"):
-        items[:] = longest_first(items, LONGEST)
-
-
-def pytest_runtestloop(session: pytest.Session) -> bool | None:
-    queue = session.config.getoption("--queue")
-    if not queue or session.config.option.collectonly:
-        return None
-    run_queue(session, queue)
-    return True
+    items[:] = in_order(config, items)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -15,6 +15,29 @@ class InModule(Protocol):
 
 
 Item = TypeVar("Item", bound=InModule)
+LONGEST = (
+    *("test_fidelity_exit", "test_restarts", "test_history", "test_transcripts"),
+    *("test_faults", "test_gateway", "test_remote"),
+    *("test_flow_cables", "test_flow_faults", "test_flow"),
+)
+"""Modules that take longest, which a queue begins with."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--queue", type=Path, help="run only modules that no other container takes")
+
+
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    queue = session.config.getoption("--queue")
+    if not queue or session.config.option.collectonly:
+        return None
+    run_queue(session, queue)
+    return True
+
+
+def in_order(config: pytest.Config, items: list[pytest.Item]) -> list[pytest.Item]:
+    """The tests in the order in which a queue is worked on, if there is one."""
+    return longest_first(items, LONGEST) if config.getoption("--queue") else items
 
 
 def take_items(items: Iterable[Item], queue: Path) -> Iterator[Item]:
