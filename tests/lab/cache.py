@@ -11,6 +11,8 @@ from lab.errors import say
 
 # The newest and one more, so that two checkouts can take turns without building each time.
 KEEP = 2
+BUILDS = "build.lock"
+"""All builds hold this lock together, and whoever removes everything holds it alone."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ def build_alone(cache: Path, layer: Layer) -> None:
 
     A layer that is made of others has `ensure()` build them: no two kinds need each other.
     """
+    shared = take_lock(cache / BUILDS, fcntl.LOCK_SH)
     path = cache / f"{layer.kind}.build.lock"
     lock = try_lock(path)
     if lock is None:
@@ -78,6 +81,7 @@ def build_alone(cache: Path, layer: Layer) -> None:
             build_layer(cache, layer)
     finally:
         os.close(lock)
+        os.close(shared)
 
 
 def build_layer(cache: Path, layer: Layer) -> None:
