@@ -110,3 +110,12 @@ def remove_layer(path: Path) -> None:
     shutil.rmtree(path)
     lock_path.unlink()
     os.close(lock)
+
+
+def remove_all(cache: Path) -> None:
+    """Remove all layers that nobody uses, when nobody builds one."""
+    alone = take_lock(cache / BUILDS, fcntl.LOCK_EX)
+    for path in cache.iterdir():
+        if path.is_dir():
+            remove_layer(path)
+    os.close(alone)

@@ -1,6 +1,5 @@
 """The verbs of the lab."""
 
-import fcntl
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -9,7 +8,7 @@ from pathlib import Path
 
 from lab import cgroup
 from lab.browser import ensure_browser
-from lab.cache import BUILDS, find_cache, remove_layer, take_lock
+from lab.cache import find_cache, remove_all
 from lab.container import run_in_container
 from lab.definition import PLATFORMS
 from lab.errors import LabError
@@ -76,12 +75,7 @@ def sweep(_options: Options) -> int:
 
 def clean(options: Options) -> int:
     sweep(options)
-    cache = find_cache()
-    alone = take_lock(cache / BUILDS, fcntl.LOCK_EX)
-    for path in cache.iterdir():
-        if path.is_dir():
-            remove_layer(path)
-    os.close(alone)
+    remove_all(find_cache())
     return 0
 
 
