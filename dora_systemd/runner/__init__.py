@@ -1,8 +1,8 @@
-"""The main process of a unit, and the programs that run beside it.
+"""The main process of a unit, and the programs that run next to that process.
 
 `check.py`, `build.py` and `stop_post.py` are programs. `needs.py` waits for what nodes need.
 `requests.py` answers restarts and stops of single nodes; its docstring has the requests to dora
-that count no restart. A stopped node that others read is a launcher that waits at its gate: its
+that count no restart. A stopped node that others read is a launcher that waits at its gate: the
 readers keep running, and receive from the node again after a restart. dora adds a node only on the
 machine of its coordinator, so on members a stop is final.
 

@@ -25,7 +25,7 @@ def check_start(
 ) -> tuple[DoraCheck, Prepared]:
     """Read and check the dataflow of `options` as at a start. Raises DoraSystemdError.
 
-    own: the options with what they say of this machine's nodes. environment: of the nodes.
+    own: the options for the nodes of this machine. environment: of the nodes.
     """
     check = DoraCheck(options, environment)
     prepared = check.beside(lambda: prepare(options, environment))

@@ -1,8 +1,8 @@
 """The life of a cell: what the main process of a dataflow's unit does, see runner/__main__.py.
 
-run_cell() lives as long as the unit. It runs the dataflow once, and again whenever a reload asks
-for that: each run_once() has its own coordinator, daemon and pump. What outlasts a run (pipes,
-groups, reloader, sockets) is in Runs.
+run_cell() lives as long as the unit. It runs the dataflow once, and again whenever a reload
+requires a new run: each run_once() has its own coordinator, daemon and pump. What outlasts a run
+(pipes, groups, reloader, sockets) is in Runs.
 """
 
 import asyncio
@@ -121,7 +121,7 @@ class Runs:
     """What all runs of the dataflow share. Raises OSError if the unit's cgroup is not ours.
 
     given: the options before links were resolved. unit: cgroup directory. environment: that of the
-    nodes. check: dora's, for the first run. beside: tasks that outlast a run. clock: that of the
+    nodes. check: dora's, for the first run. `beside`: tasks that outlast a run. clock: that of the
     stop that ends the last run. boot: dora's processes of the first run, if they exist already.
     """
 
@@ -165,7 +165,7 @@ def role_of(options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -
 
 
 async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
-    """Run the dataflow, and again as often as reloads ask for it."""
+    """Run the dataflow, and again for each reload that requires a new run."""
     reach = partial(read_coordinator, runs.paths.control)
     beside = runs.beside
     beside.spawn("reload", runs.reloader.work())

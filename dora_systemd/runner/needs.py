@@ -1,8 +1,8 @@
 """Waits for what nodes need: tasks of a run, only if a node has needs.
 
-A thread looks at the paths, because a file system may hang. It looks when a directory on the way to
-one of them changes, and every _LOOK_SECONDS: not all file systems tell of changes. The decisions
-are in decisions/needs/steps.py, the gates in runner/nodes/launcher_gates.py.
+A thread checks the paths, because a file system may hang. The thread checks them when a parent
+directory of a path changes, and every _LOOK_SECONDS: not all file systems report changes. The
+decisions are in decisions/needs/steps.py, the gates in runner/nodes/launcher_gates.py.
 """
 
 import asyncio
@@ -73,7 +73,7 @@ class Watch:
 
 _LOOK_SECONDS = 2.0
 _PAUSE_SECONDS = 0.05
-"""A directory may change without end, such as /tmp: more looks than this would only cost time."""
+"""Shortest time between two checks: a directory such as /tmp may change all the time."""
 _AGAIN = "plugged in again"
 _STATES = (State.WAITING, State.RUNNING)
 
@@ -140,7 +140,7 @@ class Needs:
             return
         missing = {node: self._missing(node, seen) for node, seen in found.items()}
         gates, is_running = self._run.nodes.gates, cell.state is State.RUNNING
-        # A stop that somebody asked for closes a gate, too.
+        # A requested stop of a node closes its gate, too.
         passed = frozenset(filter(gates.is_passing, self._passed))
         for step in list(need_steps(cell.nodes, missing, is_running, passed)):
             if step.node not in self._losing and not self._run.lock.locked():

@@ -1,4 +1,4 @@
-"""Answers what people ask at the socket of the runner of single nodes, and before a restart.
+"""Answers requests to the runner's socket: about single nodes, and checks before a restart.
 
 A request for a node is recorded before it is carried out, see decisions/cell/status.py. A restart
 replaces the process as a reload does, see runner/reload/swap.py. Nothing brings back a node after
@@ -199,13 +199,13 @@ class NodeRequests:
         return f"Node stopping: {node}"
 
     async def _tell(self, run: Run, target: Target, event: life.NodeAsked) -> None:
-        """Record what was asked for, on the machine of the node too, before it is done."""
+        """Record a request, on the machine of the node too, before the request is carried out."""
         run.pump.push(event)
         await self._role.tell_asked(target.status.machine, event)
 
 
 def _give_up(run: Run, node: str, error: DoraSystemdError) -> None:
-    """Dora does not start the node again: it has failed if it has ended."""
+    """Mark an ended node as failed, because dora refuses to start the node again."""
     if not run.pump.cell.nodes[node].pid:
         how = Exit(words=error.message.removeprefix("cannot do that in "))
         run.pump.push(life.NodeExited(now_us(), node, how, will_restart=False))
@@ -241,9 +241,9 @@ def _not_running(why: str) -> DoraSystemdError:
 class Recheck:
     """Answers {"verb": "check"}: whether the dataflow could start again.
 
-    `doractl restart` asks before it stops anything. The files are checked as the nodes' user, in
-    their sandbox and with their environment, and the errors are those of a start. `answer` answers
-    all other requests. environment: of the nodes.
+    `doractl restart` sends this request before it stops anything. The files are checked as the
+    nodes' user, in their sandbox and with their environment, and the errors are those of a start.
+    `answer` answers all other requests. environment: of the nodes.
     """
 
     def __init__(self, role: Alone, environment: Mapping[str, str], answer: Answer) -> None:
@@ -262,7 +262,7 @@ class Recheck:
         try:
             self._check()
         except TimedOut:
-            return None  # a busy machine says nothing about the files
+            return None  # a check that times out on a busy machine proves nothing about the files
         except DoraSystemdError as error:
             return error
         return None

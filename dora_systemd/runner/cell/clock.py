@@ -26,7 +26,7 @@ _SLACK_SECONDS = 2.0
 class Gaps:
     """Notices that this process did not run for a while, as when its unit was frozen.
 
-    now: seconds of a clock that goes on meanwhile.
+    now: seconds of a clock that does not stop while this process does not run.
     """
 
     def __init__(self, now: Callable[[], float]) -> None:
@@ -35,7 +35,7 @@ class Gaps:
 
     @contextmanager
     def within(self, seconds: float) -> Iterator[None]:
-        """A block that takes at most `seconds`, unless this process does not run."""
+        """Run a block that takes at most `seconds`, and note a gap if the block takes longer."""
         begun = self._now()
         yield
         if self._now() - begun > seconds + _SLACK_SECONDS:
@@ -107,7 +107,7 @@ class Keepalive:
         self._ended = threading.Event()
 
     async def beat(self) -> None:
-        """Send messages while the loop goes round, without end."""
+        """Send messages as long as the event loop runs. Returns only if cancelled."""
         threading.Thread(target=self._run, name="keepalive", daemon=True).start()
         try:
             while True:

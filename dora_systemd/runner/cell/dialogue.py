@@ -31,9 +31,9 @@ from dora_systemd.values import SECOND
 _SETTLE_SECONDS = 0.02
 """Time for the exit of a child to be seen, which explains a connection that is lost."""
 _TURNS = 5
-"""Turns of the loop in which a signal of the runner is heard that came before the exit of a child:
-one reads it, the next handles it. `systemctl kill` signals all processes of the cell, the runner
-first, and the pump must see that signal before the exit of a child that the same one has killed."""
+"""Turns of the event loop that receive a signal to the runner before the exit of a child: one turn
+reads the signal, the next handles it. `systemctl kill` signals all processes of the cell, the
+runner first, and the pump must see the signal before the exit of a child that it killed."""
 _AGAIN_SECONDS = 0.02
 _QUIET_SECONDS = 0.1
 _WAITING_SECONDS = 1.0
@@ -155,7 +155,7 @@ class Dialogue(Tasks):
         self._events_ended()
 
     def _events_ended(self) -> None:
-        """The coordinator tells no more of the run."""
+        """Report that the coordinator sends no more events of the run."""
         self._pump.push(life.ConnectionLost(now_us()))
 
     def _is_here(self, node: str) -> bool:
@@ -164,10 +164,10 @@ class Dialogue(Tasks):
         return True
 
     def _hear_elsewhere(self, record: protocol.LogRecord) -> None:
-        """Handle what dora says of a node on another machine."""
+        """Handle a record of dora about a node on another machine."""
 
     def _is_own(self, node: str) -> bool:
-        """Whether it is no node of the dataflow, but one that this runner has added."""
+        """Whether this runner has added the node, which the dataflow does not contain."""
         return bool(self._options.owes) and is_probe(node)
 
     def _hear(self, record: protocol.LogRecord) -> None:
@@ -212,7 +212,7 @@ class Dialogue(Tasks):
                 results = {node: how for node, how in results.items() if not self._is_own(node)}
                 return self._pump.push(life.ResultKnown(now_us(), results))
             if self._pump.cell.state is not State.CLOSING:
-                return None  # the run goes on, which answers ASK_RESULT in WAITING
+                return None  # the run continues, which answers ASK_RESULT in WAITING
             await asyncio.sleep(_AGAIN_SECONDS)
 
     async def _ask_stop(self) -> None:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Alone:
-    """The cell of the only machine of its dataflow.
+    """The role of a machine that runs all nodes of the dataflow.
 
     options: of the runner. find_own_refusal: the error with which this machine would refuse to
     start again.
@@ -41,12 +41,12 @@ class Alone:
 
     @property
     def sessions(self) -> Mapping[str, Session]:
-        """What its socket can do, besides answers to single requests."""
+        """The sessions of the runner's socket by verb; all other requests get a single answer."""
         return {}
 
     @property
     def door(self) -> "Door | None":
-        """What has listened at its socket from the beginning."""
+        """The Door that has listened at the runner's socket since its start, if there is one."""
         return None
 
     @property
@@ -55,18 +55,18 @@ class Alone:
         return self.options.start_timeout
 
     def own(self, options: RunnerOptions) -> RunnerOptions:
-        """The options with what they say of this machine's nodes."""
+        """Return the options for the nodes of this machine."""
         return options
 
     def here(self, dataflow: Dataflow) -> Dataflow:
-        """The dataflow with this machine's nodes."""
+        """Return the dataflow with only the nodes of this machine."""
         return dataflow
 
     def check(self, dataflow: Dataflow) -> None:
         """Raise DoraSystemdError for a dataflow that this machine would refuse at a start."""
 
     async def find_refusal(self) -> DoraSystemdError | None:
-        """The error with which another machine would refuse to start again, or None."""
+        """Return the error with which another machine would refuse a new start, or None."""
         return None
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
@@ -86,11 +86,11 @@ class Alone:
         return dora.start_coordinator()
 
     def definition(self, node: Mapping[str, Any]) -> Mapping[str, Any]:
-        """A node as dora gets it while the run goes on."""
+        """Return the definition of a node that dora gets while the run lasts."""
         return node
 
     async def tell_asked(self, machine: str, event: NodeAsked) -> None:
-        """Let the machine of a node know what somebody has asked for, before it happens."""
+        """Notify the node's machine of a requested restart or stop, before that is carried out."""
 
     def cell(self, cell: Cell) -> Cell:
         """The cell at the beginning of a run."""
@@ -99,5 +99,5 @@ class Alone:
     def dialogue(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> Dialogue:
-        """What carries out the actions of the run."""
+        """Return the Dialogue that carries out the actions of the run."""
         return Dialogue(options, pump, dora, nodes, pipes)

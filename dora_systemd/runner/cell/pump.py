@@ -55,8 +55,8 @@ class Pump:
     """Holds the cell, changes it by events, and publishes its state.
 
     this_life: the same for all runs of a life. Call connect() before the first push().
-    end: resolves to the exit status, even if the action EXIT fails. amend: adds to the table what
-    other machines say. on_event: is given each event before it changes the cell.
+    end: resolves to the exit status, even if the action EXIT fails. amend: adds the nodes of other
+    machines to the table. on_event: receives each event before the event changes the cell.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class Pump:
             if self._is_ready:
                 # Else READY=1 comes at the end, which systemd 262 refuses after this.
                 notify.send_stopping()
-            fd_store.forget_lives()  # a restart that a person asks for has no delay
+            fd_store.forget_lives()  # a restart that a person requests has no delay
 
     async def wait(self, is_so: Callable[[Cell], bool], seconds: float | None) -> bool:
         """Wait until `is_so` holds for the cell; False if it does not within `seconds`."""
@@ -216,7 +216,7 @@ class Pump:
         self._write_table()
 
     def refresh(self) -> None:
-        """Write the table again, because what the nodes say of themselves has changed."""
+        """Write the table again, because the STATUS= of a node has changed."""
         self._write_table()
 
     def _write_table(self) -> None:
@@ -227,7 +227,7 @@ class Pump:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)
             self._is_unwritten = False
         except DoraSystemdError as error:
-            # Only `list` needs the table: the event that is being handled must go on.
+            # Only `list` needs the table: the present event must be handled in any case.
             self._report_unwritten(error)
 
     def _report_unwritten(self, error: DoraSystemdError) -> None:

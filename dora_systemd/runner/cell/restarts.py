@@ -75,7 +75,7 @@ def hold_back(options: RunnerOptions, paths: CellPaths, old: float | None = None
     """Wait for the rest of a short delay: at most HEAD_START, from when systemd began this process.
 
     A start, also after a requested stop, has no lives before it, and waits for nothing. old:
-    seconds since systemd began this process, None to ask the kernel.
+    seconds since systemd began this process, None to read the time from the kernel.
     """
     if not fd_store.lives():
         return
@@ -137,7 +137,7 @@ async def forget_restarts(options: RunnerOptions) -> None:
 _TICK = SECOND // os.sysconf("SC_CLK_TCK")
 """The accuracy of the start of a process."""
 ASK_SECONDS = 5.0
-"""Until learn_first() asks: when most dataflows have started, which the question must not delay."""
+"""Delay of the request of learn_first(), which must not slow down the start of the dataflow."""
 
 
 def is_first_life(policy: RestartPolicy, name: str, is_user: bool) -> bool:
@@ -189,11 +189,11 @@ def begin_life(options: RunnerOptions, is_user: bool) -> Life:
 
 
 async def learn_first(life: Life, name: str, is_user: bool, seconds: float = ASK_SECONDS) -> None:
-    """Ask systemd once whether it has restarted the unit, if that is all that is not known.
+    """Request NRestarts= from systemd once, if only it shows whether this life is the first.
 
-    That is so of each unit that doractl enable has written. Without it every `list` would ask: the
-    number does not change before the next life, and a reset only makes it 0. seconds: to wait
-    before that.
+    So it is with each unit that doractl enable has written. Without learn_first() every `list`
+    would request NRestarts=, which does not change before the next life; a reset only makes
+    NRestarts= 0. seconds: delay of the request.
     """
     import asyncio
 
@@ -201,7 +201,7 @@ async def learn_first(life: Life, name: str, is_user: bool, seconds: float = ASK
 
     if life.may_be_first:
         await asyncio.sleep(seconds)
-        # No thread or process may be left for it: then list asks.
+        # The limit of threads or processes may be reached: then `list` requests NRestarts=.
         with contextlib.suppress(OSError, RuntimeError):
             question = beside(partial(asked, "NRestarts", name, is_user, 1))
             life.is_first = await asyncio.wrap_future(question) == 0

@@ -2,11 +2,11 @@
 
 The links of a head wait for its ports, and the daemon of a member joins the head meanwhile.
 
-`doractl member` has made a connection for its relay, and has said in it what to run. Its end for
-the runner comes by standard input. It is not standard input itself: systemd keeps a copy of that
-as long as the unit has any process, and the head has to know at once that this one has ended.
-Imports only what loads quickly. addresses below: of the options; the daemon of a machine listens on
-the first one.
+`doractl member` has created a pair of sockets, one for its relay and one for the runner, and has
+sent the Part through the pair. The socket of the runner arrives as a message on standard input.
+Standard input itself would not do: systemd keeps a copy as long as the unit has any process, and
+the head must notice at once that the runner has ended. This module imports only what loads quickly.
+addresses below: of the options; the daemon of a machine listens on the first address.
 """
 
 import json
@@ -100,7 +100,7 @@ def _arguments(
 
 
 class HeadBoot(Boot):
-    """The dora of a head, on ports that all machines know. door: tells them the links."""
+    """The dora of a head, on ports that all machines know. door: sends the ports to the links."""
 
     def __init__(
         self, options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
@@ -120,12 +120,12 @@ class HeadBoot(Boot):
 
 
 def forwards(options: RunnerOptions, ports: Forwards) -> Forwards:
-    """What a link is told. Without ssh on the way, zenoh's ports are those of other addresses."""
+    """Return the ports for a link. With direct connections, ssh does not forward zenoh's ports."""
     return replace(ports, zenoh={}) if options.addresses else ports
 
 
 def greeting(line: bytes, members: tuple[str, ...], ports: Forwards) -> tuple[bytes, bytes]:
-    """The ports for a link, and its request without another wish for them; see Greet."""
+    """Return the ports for a link, and its request marked as greeted; see Greet."""
     try:
         request = json.loads(line)
         is_link = request.get("verb") == "link" and request.get("machine") in members
@@ -137,7 +137,7 @@ def greeting(line: bytes, members: tuple[str, ...], ports: Forwards) -> tuple[by
 
 
 class MemberBoot(EarlyDaemon):
-    """The daemon of a member. part: what its head has said. rest: what it has said since.
+    """The daemon of a member. part: the Part from the head. rest: received after the Part.
 
     Raises OSError, and DoraSystemdError (USAGE) if there is no head.
     """
@@ -162,14 +162,14 @@ class MemberBoot(EarlyDaemon):
 
 
 def _said(connection: socket.socket) -> bytes:
-    """What the head has said before this process began; b"" if nothing."""
+    """Receive what the head sent before this process began; b"" for nothing."""
     with suppress(BlockingIOError):
         return connection.recv(MAX_LINE, socket.MSG_DONTWAIT)
     return b""
 
 
 def received() -> socket.socket:
-    """The connection that waits in standard input, which is /dev/null from then on.
+    """Receive the connection that waits in standard input, and replace stdin by /dev/null.
 
     Raises DoraSystemdError (USAGE) if there is none.
     """
@@ -187,6 +187,6 @@ def received() -> socket.socket:
 
 
 def no_head() -> DoraSystemdError:
-    """The error of a member that nobody has told what to run."""
+    """Return the error of a member that has received no Part."""
     hint = "doractl start on the head starts the members"
     return DoraSystemdError("cannot run a member: no head says what to run", hint, ExitCode.USAGE)

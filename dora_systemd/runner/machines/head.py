@@ -68,10 +68,10 @@ _AGAIN_SECONDS = 0.05
 _LOOK_SECONDS = 0.2
 _WATCH_SECONDS = 2.0
 _WORD_SECONDS = 1.0
-"""Time for a member to say itself why its daemon is gone, or what a node has done."""
+"""Time for a member to report why its daemon has ended, or why it ended a node."""
 _EXTEND_SECONDS = 10.0
 _NOTE_SECONDS = 0.05
-"""Time for dora to say that an exit is of a process that it has replaced: its next words."""
+"""Time for dora to report that an exit was of a replaced process; the report comes next."""
 _TOLD_SECONDS = 3.0
 """Longer than a member takes until its table comes, with the next beat."""
 
@@ -89,12 +89,12 @@ class Head(Shared):
 
     @property
     def door(self) -> Door | None:
-        """It has told the links their ports."""
+        """The Door that has sent the ports to the links."""
         return self._door
 
     @property
     def sessions(self) -> Mapping[str, Session]:
-        """The link of each machine begins one."""
+        """The sessions by verb; the link of each machine begins a session."""
         return {"link": self.roster.link, **dict.fromkeys(("reload", "hot-reload"), self._refuse)}
 
     async def _refuse(self, request: Request, ends: Ends) -> None:
@@ -108,12 +108,12 @@ class Head(Shared):
         check_placed(self.options, dataflow)
 
     async def find_refusal(self) -> DoraSystemdError | None:
-        """Have all members check their parts: one that is away, or differs, cannot start again."""
+        """Have all members check their parts; return the error of the first that cannot start."""
         content = Path(self.options.dataflow).read_bytes()
         return await self.roster.find_refusal(hashlib.sha256(content).hexdigest())
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
-        """Note what the members have to compare."""
+        """Pass to the roster what the members compare: the descriptor's digest, dora's version."""
         self.check(prepared.dataflow)
         content = Path(self.options.dataflow).read_bytes()
         # At boot nobody is present to repair a missing machine.
@@ -122,14 +122,14 @@ class Head(Shared):
         self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version(), is_awaited)
 
     def begin_again(self, last: Cell) -> None:
-        """Take other ports: sshd may still have those of the last run on a lost machine."""
+        """Choose other ports: sshd on a lost machine may still hold those of the last run."""
         self._ports = choose_ports(self.roster.names, self.options.addresses)
         self.roster.begin_again(self._ports, last.lost)
 
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
-        """A coordinator and a daemon on the ports that all machines know."""
+        """Return an Engine whose coordinator and daemon use the ports that all machines know."""
         addresses, ports = self.options.addresses, self._ports
         own = shared_environment(environment, addresses)
         more = head_arguments(ports, own, addresses)
@@ -151,12 +151,12 @@ class Head(Shared):
         )
 
     def definition(self, node: Mapping[str, Any]) -> Mapping[str, Any]:
-        """A node with dora's directory on its machine."""
+        """Return the definition of a node with dora's directory on the node's machine."""
         (placed,) = with_works({"nodes": [node]}, self.roster.works())["nodes"]
         return dict(placed)
 
     async def tell_asked(self, machine: str, event: life.NodeAsked) -> None:
-        """Tell a member, and wait until its table has it: else it takes the end for a crash."""
+        """Notify a member, and wait for its table: else the member records the end as a crash."""
         if machine:
             self.roster.tell(wire.Asked(event.node, event.what, event.by))
             with contextlib.suppress(TimeoutError):
@@ -199,7 +199,7 @@ class HeadDialogue(Dialogue):
         self.spawn(f"compare the files of machine {machine}", self._look_at(machine, told))
 
     async def _look_at(self, machine: str, told: str) -> None:
-        """Say which files of a member are others than here: nothing copies them at a restart."""
+        """Report the files that differ between a member and the head: no restart copies them."""
         try:
             there = parse_digests(told)
         except (ValueError, RecursionError):
@@ -336,12 +336,12 @@ class HeadDialogue(Dialogue):
             self._pump.push(event)
 
     def _is_unexplained(self, node: str) -> bool:
-        """Whether its member may have ended it, and has not said so yet: that comes another way."""
+        """Whether the member may have ended the node: its report takes another way than dora's."""
         event, status = self._exits.get(node), self._pump.cell.nodes.get(node, NodeStatus())
         return event is not None and event.exit == exit_of(-SIGABRT) and not status.hung
 
     def _hear(self, record: protocol.LogRecord) -> None:
-        """Handle what dora says: that an exit was of an old process it says next."""
+        """Handle a record of dora; hold back an exit until the next record explains it as stale."""
         is_stale = life_events.is_note_of_stale(record)
         for node in [record.node] if record.node else list(self._exits):
             if is_stale or not self._is_unexplained(node):

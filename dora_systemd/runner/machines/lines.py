@@ -22,11 +22,11 @@ from dora_systemd.errors import DoraSystemdError
 
 _LEASE = round(LEASE_SECONDS / BEAT_SECONDS)
 _MOST_UNSENT = 4 * MAX_LINE
-"""Bytes for a side that does not read: then the talk ends."""
+"""Bytes waiting for a side that does not read, after which the connection is ended."""
 _MOST_LINES = 200
-"""In one beat: there are three, or those of a whole lease after a gap."""
+"""Received lines per heartbeat: usually three, after a gap those of a whole lease."""
 _MOST_BYTES = 8 * MAX_LINE
-"""In one beat: to read them must not take the time of everything else."""
+"""Received bytes per heartbeat: reading them must not delay everything else."""
 
 Hear = Callable[[Message], None]
 
@@ -43,7 +43,7 @@ class Lines:
         self._heard = self._bytes = 0
 
     def send(self, message: Message) -> None:
-        """Send a message, unless the talk has ended."""
+        """Send a message, unless the connection has ended."""
         if self._writer.is_closing():
             return
         self._writer.write(format_message(message))
@@ -51,12 +51,12 @@ class Lines:
             self.end("the other side does not read")
 
     def end(self, why: str) -> None:
-        """End the talk now."""
+        """End the connection now. why: the reason, one line."""
         self._why = why
         self._writer.transport.abort()
 
     async def talk(self, hear: Hear) -> str:
-        """Pass messages to `hear` until the talk ends; the reason, one line."""
+        """Pass messages to `hear` until the connection ends; return the reason, one line."""
         beats = asyncio.create_task(self._beat())
         try:
             await self._read(hear)
@@ -65,7 +65,7 @@ class Lines:
         except ValueError:
             self._break("a line is too long")
         except Exception as error:
-            # Else it would go on to count as there, and nobody would read what it says.
+            # Else the other side would count as connected, and nobody would read its lines.
             self._break(f"what it says cannot be handled: {type(error).__name__}")
         finally:
             beats.cancel()

@@ -1,8 +1,8 @@
 """A member of a dataflow with several machines: it runs the nodes that the head has placed on it.
 
-It has a daemon and no coordinator. It acts while one session lasts, which begins with a Part; when
-that ends it ends its nodes, by itself and with success: the head decides what follows. Whatever it
-has been told is in memory only.
+A member has a daemon and no coordinator. A member acts during one session, which begins with a
+Part. At the end of the session the member stops its nodes and exits with success: the head decides
+what follows. What the head has sent is in memory only.
 """
 
 import asyncio
@@ -168,7 +168,7 @@ class Member(Shared):
         return table
 
     async def _tell_programs(self) -> None:
-        """Say once what the nodes run: their files may be older than those of the head."""
+        """Send the digests of the nodes' files once: the files may be older than the head's."""
         if self._prepared is None:
             return
         own = self.options, self._prepared, self._environment
@@ -178,18 +178,18 @@ class Member(Shared):
             self.send(wire.Programs(format_digests(digests)))
 
     def _tell_hung(self, event: life.Event) -> None:
-        """Explain the signal that ends a node, before dora tells the head of its end."""
+        """Report to the head why a node was ended, before dora reports the end of the node."""
         if isinstance(event, life.NodeHung):
             self.send(wire.Hung(event.node, event.reason, event.record))
 
     def _send_table(self) -> None:
-        """With each beat, if something is new."""
+        """Send the table, if it has changed since the last heartbeat."""
         if self._table != self._told and len(self._table) < wire.MAX_LINE // 2:
             self._told = self._table
             self.send(wire.Table(self._table))
 
     def send(self, message: wire.Message) -> None:
-        """Say something to the head, if it is there."""
+        """Send a message to the head, if the head is connected."""
         if self._lines is not None:
             self._lines.send(message)
 
@@ -197,7 +197,7 @@ class Member(Shared):
         await self.talk(await self._take_over(self._boot))
 
     async def talk(self, ends: Ends) -> None:
-        """Do what the head says until it is gone."""
+        """Carry out the messages of the head until the connection ends."""
         part = self._boot.part
         self._lines = Lines(ends, self._send_table)
         if reason := self._other_version(part):

@@ -23,12 +23,12 @@ from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
 _POLL_SECONDS, _SOON, _LATER_SECONDS = 0.05, 200, 0.5
-"""How often to look for the run of the head: less after a while, for it may be days away."""
+"""Intervals of the polls for the run of the head, which may start days later: then longer ones."""
 _EXPLAIN_SECONDS = 0.5
-"""Time for the session to end, which says more than a lost connection to dora."""
+"""Time for the session to end: its reason is better than that of a lost connection to dora."""
 _ASK_SECONDS = 2.0
 _ANSWER_SECONDS = 1.0
-"""Time for the head to hear that this part ends; it is part of the time of a stop."""
+"""Time for the head to receive that this part ends; included in the time of a stop."""
 _FIND_SECONDS = 10.0
 _UNKNOWN = ("", "offline", "unknown")
 _GOING_DOWN = "the machine is shutting down"
@@ -36,7 +36,7 @@ _ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
 
 
 class Voice(Protocol):
-    """What talks with the head."""
+    """The connection of a member to its head."""
 
     stops_by_head: bool  # the head knows that this part ends
     grace: int  # µs that the head leaves the nodes
@@ -44,7 +44,7 @@ class Voice(Protocol):
     is_going_down: Callable[[bool], bool]  # whether systemd, or that of the user, stops everything
 
     def send(self, message: wire.Message) -> None:
-        """Say something to the head, if it is there."""
+        """Send a message to the head, if the head is connected."""
 
 
 class MemberDialogue(Dialogue):
@@ -66,7 +66,7 @@ class MemberDialogue(Dialogue):
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
     ) -> dict[Do, Callable[[], None]]:
-        """Those of one machine, without all that the head asks dora."""
+        """Return the actions of a single machine, without requests that the head sends to dora."""
         own = super().actions(descriptor, variables)
         return {
             **own,
@@ -79,7 +79,7 @@ class MemberDialogue(Dialogue):
         }
 
     async def _find_run(self) -> None:
-        """Tell the head that the daemon has joined, and wait for the run that it starts."""
+        """Report to the head that the daemon has joined, and wait for the run of the head."""
         _, paths = self._nodes.places
         self._nodes.expect()
         self._voice.send(wire.Ready(str(paths.work)))
@@ -121,9 +121,9 @@ class MemberDialogue(Dialogue):
             self._pump.push(life.ResultKnown(now_us(), results))
 
     async def _stop(self) -> None:
-        """Somebody stops this part here: the head has to know before the nodes end.
+        """Stop the nodes for a stop requested on this machine, after notifying the head.
 
-        Else it may hear of them first, by dora, and take their ends for crashes.
+        Without the notice, dora may report the ends of the nodes to the head as crashes.
         """
         is_down = await asyncio.to_thread(self._is_going_down)
         self._tell_end(lambda: is_down)  # on the loop: a connection is no thread's but its own
@@ -157,7 +157,7 @@ class MemberDialogue(Dialogue):
         leave()
 
     def _tell_end(self, is_going_down: Callable[[], bool]) -> None:
-        """Say once why this part ends, unless the head knows."""
+        """Report once why this part ends, unless the head has ended it."""
         cell = self._pump.cell
         if self._has_told:
             return
@@ -172,10 +172,10 @@ class MemberDialogue(Dialogue):
 
 
 def is_going_down(is_of_user: bool) -> bool:
-    """Whether systemd stops everything, and not only this unit; see is-system-running.
+    """Return whether systemd stops everything, and not only this unit; see is-system-running.
 
-    Also if it cannot be asked, as when the message bus has been stopped already: a head that starts
-    again for nothing does less harm than one that stays down after a reboot.
+    True also if systemd does not answer, as when the message bus is stopped already: a head that
+    starts again in vain does less harm than a head that stays down after a reboot.
     """
     scope = ["--user"] if is_of_user else []
     with contextlib.suppress(DoraSystemdError):
@@ -185,10 +185,10 @@ def is_going_down(is_of_user: bool) -> bool:
 
 
 async def find_pids(pump: Pump, nodes: Nodes) -> None:
-    """Tell the pids of nodes that are starting, until each of them is known or has gone on.
+    """Find the pids of starting nodes, until each is known or its node is not starting any more.
 
-    dora has told of them before this machine could hear it: a member looks for the run that the
-    head has started. Their launchers wait for the pipes, and have noted their pid.
+    dora reports the pids before a member has found the run of the head and receives events. The
+    launchers wait for the pipes, and have written their pids to files.
     """
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(_FIND_SECONDS):

@@ -34,7 +34,7 @@ from dora_systemd.terminal_text import short_line
 from dora_systemd.values import quoted
 
 _SILENT_BEATS = 3
-"""A member of which nothing was heard for so many beats may be gone, so dora is not asked."""
+"""Beats without a message after which a member may be gone, and dora gets no request for it."""
 _REFRESH_SECONDS = 0.5
 """The table of the head is written at most so often because of the members."""
 _HUNG = ("node-hung", "node-watchdog")
@@ -65,7 +65,7 @@ class Member:
 
     @property
     def is_heard(self) -> bool:
-        """Whether something was received from the member a short time ago."""
+        """Whether a message from the member arrived within the last _SILENT_BEATS heartbeats."""
         return self.lines is not None and self.lines.silent < _SILENT_BEATS
 
 
@@ -109,7 +109,7 @@ class Roster:
         self._digest, self._dora, self.is_awaited = digest, dora, is_awaited
 
     def close(self) -> None:
-        """The run is about to end: its ports and its token are of no use to a new link."""
+        """Refuse new links: the run is about to end, and the next run has other ports."""
         self._is_closed = True
 
     def begin_again(self, ports: wire.Forwards, lost: frozenset[str]) -> None:
@@ -122,7 +122,7 @@ class Roster:
             member.work, member.has_left, member.failed = "", False, 0
 
     def set_token(self, token: str) -> None:
-        """The coordinator listens: tell those that are there already."""
+        """Send the Part to the connected members, now that the coordinator listens."""
         self._token = token
         for name in self._members:
             self._send_part(name)
@@ -153,7 +153,7 @@ class Roster:
     async def find_refusal(
         self, digest: str, seconds: float = _CHECK_SECONDS
     ) -> DoraSystemdError | None:
-        """The error of the first member that could not start again, or does not say; or None.
+        """Return the error of the first member that could not start again or does not answer.
 
         digest: of the descriptor, see wire.Check.
         """
@@ -168,12 +168,12 @@ class Roster:
         return next(filter(None, refusals), None)
 
     def has_heard(self, machine: str, event: life.NodeAsked) -> bool:
-        """Whether the table of a machine says who has asked for what of its node."""
+        """Return whether the table of a machine contains the request of `event`."""
         node = self._members[machine].table.nodes.get(event.node)
         return node is not None and (node.asked, node.asked_by) == (event.what, event.by)
 
     def amend(self, table: CellStatus) -> CellStatus:
-        """The table of the head, with what the members say of their nodes."""
+        """Return the table of the head, with the members' rows for their nodes."""
         return merged(table, {name: one.table for name, one in self._members.items()})
 
     async def link(self, request: Request, ends: Ends) -> None:
@@ -206,7 +206,7 @@ class Roster:
         if lines is None or not self._token:
             return
         if self._members[name].words == NOT_CONNECTED:
-            # Else the last words of ssh, or how it was lost, still tell more.
+            # Else the last error of ssh, or the reason of the loss, explains more.
             self._members[name].words = NOT_JOINED
         lines.send(
             wire.Part(
@@ -226,7 +226,7 @@ class Roster:
         self.changed.set()
 
     def _lose(self, name: str, why: str, is_failure: bool = False) -> None:
-        """The talk has ended. Words that the link or the member has said explain more."""
+        """Record the end of a connection. A reason from the link or the member takes precedence."""
         member = self._members[name]
         was_ready, member.lines, member.table = bool(member.work), None, CellStatus()
         if was_ready or member.words in USUAL:
@@ -269,14 +269,14 @@ class Roster:
             self._hung(name, message)
 
     def _hung(self, name: str, message: wire.Hung) -> None:
-        """A member is believed for its own nodes, and for events that there are."""
+        """Push NodeHung, if the node is the member's own and the event is a known one."""
         is_own = placed_on(self._options.placed, message.node) == name
         if is_own and message.record in _HUNG:
             reason = short_line(message.reason, _LONGEST)
             self.push(life.NodeHung(now_us(), message.node, reason, message.record))
 
     def _take_others(self, name: str, message: wire.Taken) -> None:
-        """Begin again with other ports, unless that machine may forward none at all."""
+        """Start a new run with other ports, or give up after _MOST_TAKEN attempts in a row."""
         self._taken += 1
         if self._taken < _MOST_TAKEN:
             self.push(life.ReloadAsked(now_us()))
@@ -320,7 +320,7 @@ class Roster:
         self.push(life.Refused(now_us(), reason, cause))
 
     def _ended(self, name: str, message: wire.Ended) -> None:
-        """A member says why it ends, or its link why that is lost. The end of the talk follows."""
+        """Handle the reason of a member's end or a lost link; the end of the connection follows."""
         reason, by = (short_line(one, _LONGEST) for one in (message.reason, message.by))
         member = self._members[name]
         if not reason and not by:
@@ -336,8 +336,8 @@ class Roster:
 async def find_unreached(endpoints: Endpoints) -> dict[str, str]:
     """Find the machines whose zenoh cannot be reached, and why: only with `link: direct`.
 
-    dora starts a run that nobody can hear: what keeps daemons apart, such as a firewall, is no
-    error to dora. So the head connects before each run; zenoh logs no connection that ends at once.
+    dora starts a run even if no messages can pass: a firewall between daemons is no error to dora.
+    So the head connects before each run; zenoh logs no connection that ends at once.
     """
     found = await asyncio.gather(*(_problem(*one) for one in endpoints.values()))
     return {name: why for name, why in zip(endpoints, found, strict=True) if why}

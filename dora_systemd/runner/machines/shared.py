@@ -27,7 +27,7 @@ from dora_systemd.values import INFINITY
 
 
 class Shared(Alone):
-    """What a cell asks where machines make a difference, on one of several machines."""
+    """The role of one of several machines; head and member override it further."""
 
     @property
     def start_timeout(self) -> int:
@@ -35,11 +35,11 @@ class Shared(Alone):
         return INFINITY
 
     def own(self, options: RunnerOptions) -> RunnerOptions:
-        """The options without what they say of other machines' nodes."""
+        """Return the options without those for nodes of other machines."""
         return own_options(options)
 
     def here(self, dataflow: Dataflow) -> Dataflow:
-        """The dataflow without other machines' nodes."""
+        """Return the dataflow without the nodes of other machines."""
         return own_dataflow(self.options, dataflow)
 
 
@@ -51,7 +51,7 @@ NOISE = (
     b"peer daemon disconnected",
     b"WS coordinator connection error",
 )
-"""Warnings about what zenoh-machines.json5 wants, and about machines: we tell more of those."""
+"""Warnings that zenoh-machines.json5 causes, and those about machines, which we report better."""
 
 
 class SharedEngine(Engine):
@@ -60,7 +60,7 @@ class SharedEngine(Engine):
     machine = ""  # the name of its daemon, "" on the head
 
     async def heartbeats(self) -> list[tuple[str, int]]:
-        """The machine of each daemon that is connected, and µs since it was heard.
+        """Return the machine of each connected daemon, and µs since its last heartbeat.
 
         Raises DoraSystemdError.
         """
@@ -91,8 +91,8 @@ class MemberEngine(SharedEngine):
     def cut_off(self) -> None:
         """Kill the daemon, because its coordinator is gone.
 
-        It would look for one again at the same port of 127.0.0.1, show it the token, and start
-        what it is told to. The link is gone as well, so any user here can listen there.
+        The daemon would connect to the same port of 127.0.0.1 again, send the token, and start
+        whatever that side requests. The link is gone as well, so any user can listen on the port.
         """
         if daemon := self._children.get("daemon"):
             daemon.send_signal(signal.SIGKILL)

@@ -3,9 +3,9 @@
 Nodes with needs have one, and nodes that somebody has stopped.
 
 A gate is a FIFO. launcher.pl opens it for reading, which waits until the runner has it open, and
-reads one word. So a gate is open for as long as the runner holds its descriptor and words are in
-it, and all launchers that come meanwhile go on: dora may start the node several times. When the
-runner closes the gate, the kernel drops the rest, and the next launcher waits.
+reads one word. So a gate is open for as long as the runner holds its descriptor and the FIFO
+contains words. All launchers that read a word start the node: dora may start the node several
+times. When the runner closes the gate, the kernel drops the rest, and the next launcher waits.
 """
 
 import contextlib
@@ -62,11 +62,11 @@ class Gates:
         return node in self._needing
 
     def is_passing(self, node: str) -> bool:
-        """Whether launchers of the node go on."""
+        """Return whether the gate is open, so that launchers of the node start it."""
         return node in self._passing
 
     def open(self, node: str) -> None:
-        """Let every launcher of the node go on. Raises OSError."""
+        """Open the gate, so that every launcher of the node starts it. Raises OSError."""
         self._fill(node, _GO)
         self._passing.add(node)
 

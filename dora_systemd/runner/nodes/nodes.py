@@ -156,7 +156,7 @@ class Nodes:
         beside(partial(cgroup.move_process, self._unit / cgroup.SUPERVISOR, 0))
 
     def listen(self, run: str) -> None:
-        """Start reading the output of the nodes of `run`, which lets the launchers go on."""
+        """Start reading the output of the nodes of `run`, for which their launchers wait."""
         raise_file_limit()
         for node in self._piped:
             self._pipes.open(node)
@@ -246,7 +246,7 @@ class Nodes:
         )
 
     async def wait_gone(self, node: str, pid: int) -> None:
-        """Wait until the process `pid` of the node has ended, which dora has told to end."""
+        """Wait until the process `pid` of the node has ended, which dora has stopped."""
         while pid and self.has_process(node, pid):
             await asyncio.sleep(_GONE_SECONDS)
 
@@ -282,7 +282,7 @@ class Nodes:
     def drain(self, nodes: Iterable[str], is_live: bool = False) -> None:
         """Queue what `nodes` have written so far, before whatever is written next.
 
-        is_live: they go on, and may be in the middle of a line.
+        is_live: the nodes still run, and may be in the middle of a line.
         """
         for node in nodes:
             if (tail := self._tails.get(node)) is not None:

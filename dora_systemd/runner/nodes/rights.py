@@ -35,10 +35,10 @@ def check_first(
     group: str | None = None,
     prove: Callable[[Sequence[NodeRights]], None] = prove_rights,
 ) -> None:
-    """Check what the options say of single nodes, and prove that this machine grants their rights.
+    """Check the options of single nodes, and prove that this machine grants the nodes' rights.
 
     Raises DoraSystemdError. dataflow: with modules expanded. group: that of this process, None to
-    ask the kernel.
+    read it from the kernel.
     """
     check_named_nodes(options, dataflow)
     # A dry run of a user is in no unit, and has the rights of that shell.

@@ -41,9 +41,9 @@ _PAUSE_SECONDS = 0.01
 _DRAIN = 1024
 """Messages read before a node is ended, more than net.unix.max_dgram_qlen usually allows."""
 _REFUSALS = 60 * SECOND
-"""µs between two events about messages that are not believed, for each node."""
+"""µs between two events about refused messages, for each node."""
 _PUBLISH_SECONDS = 1.0
-"""Shortest time between two tables that are written because of what nodes say."""
+"""Shortest time between two tables that are written because of nodes' messages."""
 
 IsBlocked = Callable[[str], bool]
 """Whether a node may have to wait for the journal."""
@@ -73,14 +73,14 @@ class NodeSocket:
         self.status = self.status if message.status is None else message.status
 
     def forget(self) -> None:
-        """Forget what the process of the node has sent: it has ended."""
+        """Discard what the process of the node has sent, because the process has ended."""
         self.status, self.at_us, self.signed, self.is_triggered = "", 0, None, False
 
 
 class NotifySockets:
     """The sockets of the nodes that `watchdogs` gives one. unit: its cgroup directory.
 
-    tell: writes a life event. is_in: whether a process is in a group. clock_us: CLOCK_MONOTONIC.
+    `tell`: writes a life event. is_in: whether a process is in a group. clock_us: CLOCK_MONOTONIC.
     on_news: is called after each message.
     """
 
@@ -118,13 +118,13 @@ class NotifySockets:
             self._loop.add_reader(entry.socket, self._read, node, entry)
 
     def remove(self, node: str) -> None:
-        """Close the socket of a node that does not come back."""
+        """Close the socket of a node that will not start again."""
         if entry := self._by_node.pop(node, None):
             self._loop.remove_reader(entry.socket)
             entry.socket.close()
 
     def forget(self, node: str) -> None:
-        """The node's process has ended: what it has said does not hold for the next one."""
+        """Discard what the ended process of the node sent, before the next process starts."""
         if entry := self._by_node.get(node):
             entry.forget()
 
@@ -137,7 +137,7 @@ class NotifySockets:
         return iter(list(self._by_node.items()))
 
     def table(self) -> dict[str, Sign]:
-        """What the nodes have said, for the table that `list` reads."""
+        """Return the last status and watchdog limit of each node, for the table of `list`."""
         return {
             node: Sign(one.status, one.at_us, one.limit if one.limit < INFINITY else 0)
             for node, one in self._by_node.items()
@@ -180,14 +180,14 @@ class NotifySockets:
         return True
 
     def _doubt(self, node: str, pending: Pending) -> str:
-        """Why the message is not believed, or ""."""
+        """Return the reason to refuse the message, or ""."""
         is_own = self._is_in(self.group(node), pending.pid)
         if not pending.is_there():
             return "its sender had exited; one that waits, as systemd-notify does, is known"
         return "" if is_own else f"process {pending.pid} is not in the cgroup of the node"
 
     def _refuse(self, node: str, entry: NodeSocket, pending: Pending, reason: str) -> None:
-        """Report it, but not each time: other processes of this user could fill the journal."""
+        """Report a refused message, at a limited rate: other processes could fill the journal."""
         now = self.clock.seen
         if entry.refused_us is None or now - entry.refused_us >= _REFUSALS:
             entry.refused_us = now
@@ -200,14 +200,14 @@ class Pump(Protocol):
     cell: Cell
 
     def push(self, event: life.Event) -> None:
-        """Take one event through the table."""
+        """Change the cell by one event."""
 
     def refresh(self) -> None:
         """Write the table that `list` reads."""
 
 
 class WatchdogTimers:
-    """Watches over the nodes of one run of the dataflow. send: sends a signal to a group."""
+    """Checks the watchdogs of the nodes of one run. send: sends a signal to a cgroup."""
 
     def __init__(
         self,
@@ -228,7 +228,7 @@ class WatchdogTimers:
         self._timer: asyncio.TimerHandle | None = None
 
     async def run(self) -> None:
-        """Look at all nodes again and again."""
+        """Check all nodes once in each period of the clock."""
         self._sockets.on_news = self._hear_news
         try:
             while True:
@@ -277,7 +277,7 @@ class WatchdogTimers:
         self._watches[node] = watch
 
     def _phase(self, status: NodeStatus | None) -> tuple[Phase, int]:
-        """What the node is doing, as far as it can miss its watchdog."""
+        """Return the phase of the node, as far as it matters to the watchdog, and its pid."""
         if status is None or not status.pid or self._pump.cell.state is not State.RUNNING:
             return Phase.AWAY, 0
         phases = {"starting": Phase.STARTING, "running": Phase.RUNNING}

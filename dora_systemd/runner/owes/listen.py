@@ -49,7 +49,7 @@ def listen(node: Any, times: memoryview, seconds: float) -> None:
         elif kind in ("STOP", "INPUT_CLOSED"):
             return
         elif time.monotonic() - began < seconds / 2:
-            # It was no timeout: do not ask again at once, whatever it was.
+            # Some other event than a timeout came early: do not call next() again at once.
             time.sleep(seconds / 2)
 
 

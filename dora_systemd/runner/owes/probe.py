@@ -30,7 +30,7 @@ _TRIES = 2
 
 
 class Probe:
-    """The probe of one run. plan: of the dataflow. feeds: what to hear.
+    """The probe of one run. plan: of the dataflow. feeds: the outputs that the probe receives.
 
     tick: µs between two calls of tend(). find_python: the interpreter with dora-rs; raises
     DoraSystemdError if there is none.

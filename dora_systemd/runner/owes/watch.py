@@ -1,6 +1,6 @@
-"""Watches what nodes owe: reads when they were heard, has the judge decide, and acts.
+"""Watches expected outputs: reads when each last arrived, has the judge decide, and acts.
 
-Nobody else restarts a node for this: dora does, by its RestartNode, within the node's own budget.
+dora restarts a node for a missing output, by RestartNode, within the restarts of the node's policy.
 """
 
 import asyncio

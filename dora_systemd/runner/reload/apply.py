@@ -36,7 +36,7 @@ class Run:
 
 
 async def tell_started(run: Run, tell: Callable[[], None]) -> None:
-    """Tell the reloader when all nodes run: from then on the run is not a trial any more."""
+    """Notify the reloader when all nodes run: from then on the run is not a trial any more."""
     if await run.pump.wait(has_started, None):
         tell()
 
@@ -136,7 +136,7 @@ class Applier:
             is_needed = is_read(step.node, self._options, prepared, self._change.prepared)
             starts_first = self._options.reload.starts_first(step.node)
             await swapper.swap(definition, kind, is_needed, starts_first)
-            if old.needs:  # two launchers must not go on
+            if old.needs:  # two launchers must not start the node
                 await self.run.nodes.wait_gone(step.node, old.pid)
 
     def _tell(self, step: Step, seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""The command of `systemctl reload`: asks the runner of the unit to reload what has changed.
+"""The command of `systemctl reload`: requests a reload of what has changed from the unit's runner.
 
 ExecReload= in systemd.service(5) runs it; its exit status is the result of the reload.
 """
@@ -13,7 +13,7 @@ from dora_systemd.paths import CellPaths
 
 
 def main() -> int:
-    """Ask the runner of this unit; 0, or the exit status of doractl for the error."""
+    """Request a reload; 0, or the exit status of doractl for the error."""
     directory = os.environ.get("RUNTIME_DIRECTORY", "")
     try:
         if not directory:

@@ -1,4 +1,4 @@
-"""Compares versions of the settings file beside a dataflow while the dataflow runs.
+"""Compares versions of the settings file next to a dataflow while the dataflow runs.
 
 Reading settings needs a library that the runner does not load. So the runner starts a child
 process, `python3 -m dora_systemd.runner.reload.settings_file BEFORE AFTER PATH`, with two versions

@@ -273,7 +273,7 @@ class Watcher:
         seen.cancel()
 
     async def collect(self, options: RunnerOptions, since: Since | None = None) -> None:
-        """Give the files that change to found(), without end."""
+        """Pass each burst of changed files to found(). Returns only if watching fails."""
         with self._refusing("cannot watch files any more"):
             rules = await asyncio.to_thread(watch_rules, options)
             let_openssl_in()  # watchfiles imports anyio, which imports ssl

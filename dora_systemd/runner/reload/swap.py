@@ -8,16 +8,16 @@ other nodes have from the node, and AddNode does not open them again. So the Swa
 
     RemoveNode, then AddNode         if nobody reads the node
     RestartNode, then ReplaceNode    if somebody does: ReplaceNode starts the new process at once
-    ReplaceNode                      if dora would not restart it, or it has no process, or the
-                                     setting says that the new process starts first
+    ReplaceNode                      if dora would not restart it, or it has no process, or by the
+                                     setting the new process starts first
 
 AddNode and ReplaceNode begin with all restarts, and wait for no delay. A node with other inputs or
 outputs can only be removed and added.
 
-The Swapper sends requests, and the pump hears of their effect: exits and readiness arrive as
+The Swapper sends requests, and the pump receives their effect: exits and readiness arrive as
 events of the run. So a method that waits for the new process first pushes the event that marks the
-node as reloading in the live table, and only then asks dora. In the other order the old state
-"running" would satisfy the wait for the new process.
+node as reloading in the live table, and only then sends the request to dora. In the other order the
+old state "running" would satisfy the wait for the new process.
 """
 
 import contextlib
@@ -45,11 +45,11 @@ _WITH_PROCESS = ("starting", "ready", "running", "reloading")
 
 
 class NotReady(Exception):
-    """The new node has failed or is not ready in time; the message says which."""
+    """The new node has failed or is not ready in time; the message states which."""
 
 
 def patience(cell: Cell) -> int:
-    """Seconds that a new version may take to be ready.
+    """Return the seconds that a new version may take to be ready.
 
     A machine or a node that is slow needs longer, so it depends on how long `cell` took to start.
     """
@@ -190,14 +190,14 @@ class Swapper:
 
 
 def _is_known(node: NodeStatus) -> bool:
-    """Whether its process is known, if it has one: RemoveNode would else end one unheard of."""
+    """Whether the pid is known, if there is a process: else RemoveNode would end it unnoticed."""
     return node.state != "starting" or bool(node.pid) or bool(node.machine)
 
 
 def _has_ended(node: NodeStatus) -> bool:
-    """Whether the process has ended that ran when dora was asked to end it.
+    """Whether the process has ended that ran when dora received the request to end it.
 
-    A restart that somebody asked for can concern another machine, whose pids are not known here.
+    A requested restart can concern another machine, whose pids are not known here.
     """
     is_asked = node.asked == RESTART and node.state != "waiting"
     return node.state != "reloading" if is_asked else not node.pid
