@@ -1,7 +1,7 @@
-"""The main process of a link: it carries the lines of the runner of the head to a member, and back.
+"""The main process of a link, which passes lines between the runner of the head and a member.
 
-It ends with its ssh(1), and systemd starts it again: each connection begins with the ports and the
-part that the runner gives then. A machine that is away is no failure of the link.
+A link ends with its ssh(1), and systemd starts the link again: each connection begins with the
+ports and the Part that the runner sends then. An unreachable machine is no failure of the link.
 """
 
 import json
@@ -25,7 +25,7 @@ from dora_systemd.trust.paths import exists
 from dora_systemd.trust.sockets import connect_unix
 
 _ANSWER_SECONDS = 10.0
-"""For each answer: the runner knows its ports soon."""
+"""Time for an answer of the runner, which knows its ports soon."""
 _CHUNK = 1 << 16
 _PAUSE_SECONDS = 1.0
 _FIRST_SECONDS, _LATER_SECONDS = 0.01, 0.25
@@ -41,7 +41,7 @@ class Greeted(NamedTuple):
 
 
 def greeted(path: Path, machine: str) -> Greeted | None:
-    """A session for the link to `machine`; None if no runner is at `path` that has one now.
+    """Open a session for the link to `machine`; None if no runner at `path` accepts a session now.
 
     Raises DoraSystemdError (NO_PERMISSION) if the socket is another user's.
     """
@@ -76,7 +76,7 @@ def _first_line(runner: socket.socket) -> tuple[bytes, bytes]:
 class Watchdog:
     """Sends WATCHDOG=1 at most once a second; does nothing without NOTIFY_SOCKET.
 
-    A link that hangs looks to the head like a machine that is away, and nobody else would end it.
+    To the head, a link that hangs looks like an unreachable machine; only systemd can end the link.
     """
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class Watchdog:
 
 
 def main() -> int:
-    """Carry until ssh or the runner has ended; the exit status."""
+    """Pass lines until ssh or the runner has ended; return the exit status."""
     try:
         link = parse_link_argv(sys.argv[1:])
         return _carry(link)
@@ -108,7 +108,7 @@ def _carry(link: LinkOptions) -> int:
     tries, watchdog = 0, Watchdog()
     while (found := greeted(Path(link.socket), link.machine)) is None:
         watchdog.feed()
-        # The runner starts, or waits for its restart: systemd ends this unit if it does neither.
+        # The runner starts, or waits for its restart: otherwise systemd stops this unit.
         time.sleep(_FIRST_SECONDS if tries < _QUICK_TRIES else _LATER_SECONDS)
         tries += 1
     with found.runner:
@@ -120,9 +120,9 @@ def _carry(link: LinkOptions) -> int:
 
 
 def _connect(link: LinkOptions, found: Greeted, watchdog: Watchdog) -> None:
-    """Run ssh until either end has ended. Raises DoraSystemdError if that is of no use."""
+    """Run ssh until ssh or the runner has ended. Raises DoraSystemdError if ssh cannot log in."""
     if link.identity and not exists(Path(link.identity)):
-        # ssh would say nothing, and log in with another key.
+        # ssh would report no error, and log in with another key.
         message = f"cannot log in: the key {link.identity} is gone"
         hint = f"doractl machine remove --force {link.machine}, then doractl machine add"
         raise DoraSystemdError(message, hint, ExitCode.NO_HOST)

@@ -1,4 +1,4 @@
-"""What the head is told when a connection has ended, from ssh's own words."""
+"""Finds the reason of an ended connection, for the head, in what ssh wrote."""
 
 from dora_systemd.decisions.machines.wire import FromLink, Lost, Taken, Unreached
 from dora_systemd.decisions.remote.hosts import Host, parse_host
@@ -11,7 +11,7 @@ from dora_systemd.decisions.remote.ssh_failures import (
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 _FINAL = ("HAS CHANGED", "Host key verification failed", "Permission denied")
-"""What no new attempt changes: somebody has to."""
+"""Errors of ssh that no new attempt clears, only a person."""
 _FORWARDING = ("forwarding failed for listen port", "Could not request local forwarding")
 _ONCE, _TWICE = 1, 2
 """A machine that boots may answer the next attempt. If a person waits, the name may be mistyped."""
@@ -19,7 +19,10 @@ _VERSIONS = "install the same version of dora-systemd on both machines"
 
 
 def last_word(host: str, status: int, is_in: bool, said: str, complaint: str) -> FromLink:
-    """Why the connection has ended, and whether to try again. As ending_error()."""
+    """Return why the connection has ended, and whether to try again.
+
+    Parameters as for ending_error().
+    """
     if any(one in complaint for one in _FORWARDING):
         hint = "in sshd_config there: AllowTcpForwarding yes; each start takes other ports"
         return Taken(f"cannot forward a port to {host}: {last_line(complaint)}", hint)
@@ -33,7 +36,7 @@ def last_word(host: str, status: int, is_in: bool, said: str, complaint: str) ->
 
 
 def _not_in(error: DoraSystemdError, status: int, complaint: str) -> Lost | Unreached:
-    """ssh or the login shell there has not run doractl."""
+    """Return the reason, if ssh or the login shell on the host has not run doractl."""
     if any(one in complaint for one in _FINAL):
         return Unreached(error.message, error.hint, 0)
     if status != SSH_FAILED and status > 0:  # the login shell
@@ -46,7 +49,7 @@ def _not_in(error: DoraSystemdError, status: int, complaint: str) -> Lost | Unre
 def _without_member(
     host: Host, error: DoraSystemdError | None, status: int, complaint: str
 ) -> Unreached:
-    """doractl has not become a member there; what it refuses for good it has said itself."""
+    """Return the reason, if doractl ran on the host and has not become a member."""
     if error:
         return Unreached(error.message, error.hint, 0)
     failed, tries = failed_there(host, complaint, status), _TWICE

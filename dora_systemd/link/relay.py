@@ -1,13 +1,13 @@
 """The member's end of a link: carries lines between ssh and the runner of the member.
 
-`doractl member` executes this in its place, because that has loaded what a start needs, and this
-runs as long as the dataflow. It gets the runner's connection as a file descriptor.
+`doractl member` replaces itself by this program, because doractl has loaded what a start needs, and
+the relay runs as long as the dataflow. The relay gets the runner's connection as a file descriptor.
 
     python3 -I -S relay.py FD SECONDS
 
-If the head says nothing for SECONDS, it may be gone, and ssh need not know: nobody tells it. Then
-the connection to the runner ends, which ends the part of the dataflow here, and this session ends,
-because its ports would keep the next one out.
+A head that sends nothing for SECONDS may be gone without any notice to ssh. Then the relay ends the
+connection to the runner, which ends the part of the dataflow on this machine, and then the session,
+whose ports would block the next session.
 
 This is all of the program: imports only what Python itself has loaded, or takes no memory.
 """

@@ -1,6 +1,6 @@
-"""Carries lines between the runner of the head and ssh(1), which has a member at its other end.
+"""Passes lines between the runner of the head and ssh(1), which has a member at its other end.
 
-To the head a member is hostile: what comes from it is passed on in whole lines that have a bound.
+The head does not trust a member: lines from the member are passed on whole and of bounded length.
 """
 
 import os
@@ -23,18 +23,18 @@ from dora_systemd.decisions.machines.wire import (
 from dora_systemd.decisions.remote.stream import AfterMark
 
 ANSWER_SECONDS = 30.0
-"""For the first line of the member: a login, and doractl there, on a machine that is busy."""
+"""Time for the first line of the member: for the login and doractl on a busy machine."""
 _CHUNK = 1 << 16
 _COMPLAINT = 4096
 _END_SECONDS = 2.0
-"""For a program to end, before it is killed."""
+"""Time for a program to end on SIGTERM, before it is killed."""
 
 
 class Program:
-    """A running program with pipes, looked up in PATH. Leaving its block ends it.
+    """A running program with pipes, looked up in PATH. Leaving the context ends the program.
 
-    input, output, errors: our ends of its pipes. Raises OSError if it cannot be executed. Not
-    subprocess: that takes a megabyte of each link for good.
+    input, output, errors: our ends of its pipes. Raises OSError if the program cannot be executed.
+    Without subprocess, because that module would take a megabyte in each link.
     """
 
     def __init__(self, name: str, arguments: list[str]) -> None:
@@ -66,7 +66,7 @@ class Program:
             os.close(fd)
 
     def end(self) -> int:
-        """End it, if it has not ended; its exit status, negative for a signal."""
+        """End the program, if it still runs; return its exit status, negative for a signal."""
         if self._status is None:
             if not _waits(self.ended, 0):
                 signal.pidfd_send_signal(self.ended, signal.SIGTERM)
@@ -77,7 +77,7 @@ class Program:
 
 
 def read_now(fd: int, size: int = 1 << 16) -> bytes:
-    """What can be read without waiting; b"" if there is nothing, or will be nothing more."""
+    """Read what is available without waiting; b"" for nothing, and at the end of the file."""
     os.set_blocking(fd, False)
     with suppress(BlockingIOError):
         return os.read(fd, size)
@@ -89,9 +89,10 @@ def _waits(fd: int, seconds: float) -> bool:
 
 
 class Talk:
-    """One connection. rest: what the runner has said already. on_turn: called every second.
+    """One connection. rest: already received from the runner. on_turn: called every second.
 
-    answer_seconds: for the first line of the member. beat_seconds: of the wait for it.
+    answer_seconds: time for the first line of the member. beat_seconds: interval of the heartbeats
+    until that line.
     """
 
     def __init__(
@@ -123,11 +124,11 @@ class Talk:
         }
         for fd in self._takers:
             self._poll.register(fd, select.POLLIN)
-        # Until the member is there, ssh's pipe must not fill: only the runner's end is heard.
+        # Until the member answers, ssh's pipe must not fill: poll only for the end of the runner.
         self._poll.register(runner, select.POLLRDHUP)
 
     def carry(self) -> None:
-        """Carry until either end has ended."""
+        """Pass lines in both directions until the runner or ssh has ended."""
         deadline = time.monotonic() + self._answer_seconds
         while not self._is_over:
             self._on_turn()
@@ -143,7 +144,7 @@ class Talk:
             self._takers[fd]()
 
     def _wait_for_answer(self, deadline: float) -> None:
-        """Tell the runner that ssh is on its way: the member cannot do so yet."""
+        """Send a heartbeat for the member, which cannot yet; give up at the deadline."""
         self._send(format_message(Beat()))
         if time.monotonic() > deadline:
             self._excuse = f"no answer within {self._answer_seconds:g} s"
@@ -153,7 +154,7 @@ class Talk:
         self._is_over = True
 
     def _hang_up(self) -> None:
-        """The runner has ended, or begun another session."""
+        """End the connection, because the runner has ended or begun another session."""
         self._has_hung_up = True
         self._end()
 
@@ -170,7 +171,7 @@ class Talk:
         try:
             while data:
                 data = data[os.write(self._ssh.input, data) :]
-        except BrokenPipeError:  # ssh says why
+        except BrokenPipeError:  # ssh reports the reason on standard error
             self._poll.unregister(self._runner)
 
     def _from_member(self) -> None:
@@ -211,7 +212,7 @@ class Talk:
             self._hang_up()
 
     def part_from(self, host: str, status: int) -> None:
-        """Tell the runner why the connection has ended. status: of ssh."""
+        """Report to the runner why the connection has ended. status: of ssh."""
         while data := read_now(self._ssh.output):
             self._pass_on(self._output.feed(data))
         while data := read_now(self._ssh.errors):
@@ -233,6 +234,6 @@ class Talk:
 
 
 def tell(runner: socket.socket, message: Message) -> None:
-    """Say the last word to a runner, which may have ended."""
+    """Send the last message of a link to a runner, which may have ended."""
     with suppress(OSError):
         runner.sendall(format_message(message))
