@@ -28,7 +28,7 @@ _MIN_TOKEN = 32
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Serve until idle or told to stop; the exit status."""
+    """Serve until idle or stopped by a signal; return the exit status."""
     logging.basicConfig(format="%(message)s", level=logging.INFO)
     try:
         idle = parse_arguments(arguments)
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def parse_arguments(arguments: Sequence[str]) -> float:
-    """The idle time in seconds after which the gateway exits."""
+    """Return the idle time in seconds after which the gateway exits."""
     parser = argparse.ArgumentParser("dora-gateway", description="see dora-systemd-security(7)")
     parser.add_argument("--exit-idle-time", default="60s", metavar="DURATION")
     given = parser.parse_args(arguments).exit_idle_time

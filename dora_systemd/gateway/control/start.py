@@ -1,12 +1,12 @@
 """Start of dora's protocol: finds the file of the descriptor, and starts it as doractl does.
 
 A request has a descriptor, a directory and the id of a session, but no file name. The dora command
-1.1.0 keeps that id in out/<stem>.dora-session.yaml, which it writes before it asks. So the file is
-known without a look at what was sent.
+1.1.0 keeps the id of a session in out/<stem>.dora-session.yaml, and writes that file before the
+request. So the gateway finds the dataflow file without the descriptor that was sent.
 
-Starting from a copy of the descriptor that was sent would lose the settings file, which has the
-name of the file. Hot reload would watch a copy that nobody edits, and the copy would not tell whose
-dataflow it is.
+Starting from a copy of the descriptor that was sent would lose the settings file, whose name is
+derived from that of the dataflow file. Hot reload would watch a copy that nobody edits, and the
+copy would not show who owns the dataflow.
 """
 
 import asyncio
@@ -64,7 +64,7 @@ def _start(scope: Scope, request: Request) -> str:
 
 
 def wanted_start(request: Request) -> StartRequest:
-    """What a Start asks for. Raises DoraSystemdError."""
+    """Return the StartRequest for a Start of dora's protocol. Raises DoraSystemdError."""
     if request.body.get("write_events_to") is not None:
         hint = "unset DORA_WRITE_EVENTS_TO, or use dora run"
         raise DoraSystemdError("cannot write the events of a supervised dataflow", hint)
@@ -77,7 +77,7 @@ def wanted_start(request: Request) -> StartRequest:
 
 
 def find_file(directory: Path, session: str) -> Path:
-    """The file in `directory` with this session. Raises DoraSystemdError if not exactly one has."""
+    """Find the only file in `directory` with this session, else raise DoraSystemdError."""
     found = [path for path in _files(directory) if _session(path) == session]
     if len(found) == 1:
         return found[0]

@@ -129,7 +129,7 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
 
 
 def _over(scope: Scope, uuid: str) -> dict[str, Any]:
-    """The reply that tells the dora command that the dataflow ended right after its start."""
+    """Return the reply for the dora command if the dataflow ended right after its start."""
     word = explain(Bus(scope, for_reading=True), scope, uuid, JournalReader()).verdict.status
     if word == FINISHED:
         return {"Error": f"unknown dataflow {uuid}: it has finished already"}

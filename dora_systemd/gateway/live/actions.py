@@ -53,7 +53,7 @@ class Action:
 
 
 class Actions:
-    """All actions of a gateway. extend: tells systemd that it needs so many µs more to end."""
+    """All actions of a gateway. extend: requests so many µs more for its stop from systemd."""
 
     def __init__(self, extend: Callable[[int], object] = extend_timeout) -> None:
         self._extend = extend
@@ -62,9 +62,9 @@ class Actions:
 
     @contextmanager
     def acting(self) -> Iterator[Action]:
-        """An action during which the gateway does not rest.
+        """Run an action, during which the gateway does not exit as idle.
 
-        Raises DoraSystemdError if the gateway is about to end: it begins no more of them.
+        Raises DoraSystemdError if the gateway is about to end, and so begins no more actions.
         """
         action = Action(self)
         self._under_way.add(action)
@@ -81,19 +81,19 @@ class Actions:
         return bool(self._under_way)
 
     def hold_on(self) -> None:
-        """Keep systemd from killing a gateway that ends while an action goes on."""
+        """Keep systemd from killing a gateway that ends while an action is under way."""
         if self._ending.is_set():
             self._extend(_LONGER)
 
     def end(self) -> None:
-        """Have all of them end soon."""
+        """Have all actions end soon, and refuse new ones."""
         self._ending.set()  # first: one that begins now is in the set, or sees this
         for action in list(self._under_way):
             action.must_end = True
 
 
 ACTIONS = Actions()
-"""Those of this process."""
+"""The actions of this process."""
 
 
 def _stopped() -> DoraSystemdError:

@@ -40,7 +40,7 @@ Lines = list[dict[str, Any]]
 
 
 def log_query(scope: Scope, message: PageMessage) -> tuple[LogQuery, Lines]:
-    """The records of a dataflow, which may have ended, or of a node, and what to say of others.
+    """Return the query for a dataflow's or a node's records, and notes about missing machines.
 
     Raises DoraSystemdError.
     """

@@ -163,7 +163,7 @@ class Page:
             await self._send(type="file", number=message.number, text=text)
 
     async def _parts(self, message: PageMessage, most: int) -> AsyncIterator[Lines]:
-        """What a search has found, in parts; then tells the page how it ended."""
+        """Yield the lines that a search has found, in parts; then send its result to the page."""
         try:
             found, is_whole = await self._means.find(self._scope, message, most)
         except DoraSystemdError as error:
