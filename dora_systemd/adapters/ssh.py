@@ -14,11 +14,11 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import check_program
 
 _MOST_BYTES = 1 << 16
-"""Of what ssh has said, the last."""
+"""Bytes kept of the end of ssh's messages."""
 
 
 def start_ssh(arguments: Sequence[str], **streams: Any) -> "subprocess.Popen[bytes]":
-    """A running ssh. streams: as for subprocess.Popen().
+    """Start ssh. streams: as for subprocess.Popen().
 
     Raises DoraSystemdError: NO_HOST if there is no ssh, NO_PERMISSION if root would run another
     user's.
@@ -47,9 +47,10 @@ def read_now(fd: int, size: int = 1 << 16) -> bytes | None:
 
 
 def run_on_terminal(arguments: Sequence[str]) -> tuple[int, str]:
-    """Run ssh on the terminal of this process; its exit status, and what it has said itself.
+    """Run ssh on the terminal of this process; return its exit status and its own messages.
 
-    What the host says comes by standard output, because it has a terminal there.
+    Standard error has only ssh's messages: the command on the host has a terminal, and so writes
+    everything to standard output.
     """
     read, write = os.pipe()
     os.set_blocking(read, False)
@@ -57,8 +58,8 @@ def run_on_terminal(arguments: Sequence[str]) -> tuple[int, str]:
         with start_ssh(arguments, stderr=write) as child:
             said = _hear(child.pid, read)
             status = child.wait()
-        # Not to the end of the file: a connection that is shared, ControlPersist in ssh_config(5),
-        # goes on and keeps it open.
+        # Not to the end of the file: a shared connection, see ControlPersist in ssh_config(5),
+        # outlasts ssh and keeps the pipe open.
         return status, (said + (read_now(read) or b"")).decode("utf-8", "replace")
     finally:
         os.close(read)
@@ -66,7 +67,7 @@ def run_on_terminal(arguments: Sequence[str]) -> tuple[int, str]:
 
 
 def _hear(pid: int, read: int) -> bytes:
-    """The last that is written to a pipe until a process ends: a full pipe would hold it up."""
+    """Read a pipe until a process ends, which a full pipe would block; return the last bytes."""
     said, ended = b"", os.pidfd_open(pid)
     try:
         while ended not in select.select([ended, read], [], [])[0]:
@@ -77,16 +78,16 @@ def _hear(pid: int, read: int) -> bytes:
 
 
 class Connection:
-    """A running ssh whose output is read when it is there.
+    """A running ssh whose output is read without waiting.
 
-    is_fed: it reads our standard input; else its input is what write() gets, and stays open until
-    hang_up(). is_here: no ssh, but the last of `arguments` on this machine.
+    is_fed: ssh reads our standard input; else write() feeds its input, which stays open until
+    hang_up(). is_here: no ssh, but the last of `arguments` runs on this machine.
     """
 
     def __init__(
         self, arguments: Sequence[str], is_fed: bool = False, is_here: bool = False
     ) -> None:
-        # In a process group of its own: Ctrl+C is for doractl, which then says what ends.
+        # In its own process group: Ctrl+C reaches only doractl, which then reports what ends.
         start = partial(start_here, arguments[-1]) if is_here else partial(start_ssh, arguments)
         self._child = start(
             stdin=None if is_fed else subprocess.PIPE,
@@ -119,13 +120,13 @@ class Connection:
         return 0
 
     def hang_up(self) -> None:
-        """End the input: what follows over there then ends, and says its last words."""
+        """Close the input, so that a following command on the host ends after its last output."""
         if self._input:
             with suppress(OSError):
                 self._input.close()
 
     def close(self) -> int:
-        """End it, if it has not ended; its exit status, negative for a signal."""
+        """Kill ssh, if it still runs; return its exit status, negative for a signal."""
         self._child.kill()
         with self._child:
             status = self._child.wait()

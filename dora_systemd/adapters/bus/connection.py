@@ -219,7 +219,7 @@ def silent_bus(scope: Scope, is_private: bool) -> DoraSystemdError:
 
 
 def without_systemd(root: Path = Path("/")) -> str:
-    """Tell how a machine that was not booted with systemd gets one. root: has all its files."""
+    """Describe how to boot this machine with systemd. root: the directory with all its files."""
     try:
         kernel = (root / "proc/sys/kernel/osrelease").read_text(errors="replace").lower()
     except OSError:

@@ -67,7 +67,7 @@ class Manager(Protocol):
     ) -> str:
         """Create and start a unit; the result of the job. Without `wait`, JOB_DONE at once.
 
-        beside: units that are created at the same time, for this one to need them.
+        `beside`: units that are created at the same time, because this unit needs them.
         """
 
     def run_jobs(
@@ -146,7 +146,7 @@ def queued_job(properties: Mapping[str, Any]) -> int:
 
 
 def is_at_rest(properties: Mapping[str, Any]) -> bool:
-    """Whether ActiveState= and Job= say that a unit is down and will stay so."""
+    """Return whether a unit is down and has no job queued, by ActiveState= and Job=."""
     return properties["ActiveState"] in DOWN and not queued_job(properties)
 
 

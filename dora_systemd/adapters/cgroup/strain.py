@@ -31,9 +31,9 @@ def read_oom(path: Path) -> OomCounts:
 
 
 def read_load(path: Path) -> Load:
-    """How close a group is to its limit of memory; its throttling is for the caller to say.
+    """Read how close a group is to its memory limit; the caller adds the throttling of its CPU.
 
-    What counts is what the kernel cannot drop: it fills every group up with files it has read.
+    Only memory counts that the kernel cannot drop: caches of files fill every group up.
     """
     limits = [read_number(path / name) for name in ("memory.max", "memory.high")]
     limit = min((one for one in limits if one is not None), default=INFINITY)

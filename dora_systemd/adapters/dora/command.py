@@ -1,4 +1,4 @@
-"""The dora command: find it, run it once, ask for its version."""
+"""The dora command: find it, run it once, read its version."""
 
 import os
 import re
@@ -49,8 +49,9 @@ def find_dora(
 ) -> str:
     """Absolute path of the dora command: the one given, else of the venv, else on `search_path`.
 
-    Last comes that beside our own Python: pip has put both into one virtual environment, and what
-    is linked onto PATH is only doractl. sight: whose eyes look. Raises DoraSystemdError (NO_DORA).
+    The last candidate is next to our own Python: pip may have installed both into one virtual
+    environment, with a link on PATH only to doractl. sight: of the account that must see the
+    command. Raises DoraSystemdError (NO_DORA).
     """
     places = search_path.split(os.pathsep)
     if given is None:

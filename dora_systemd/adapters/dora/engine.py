@@ -55,7 +55,7 @@ def free_port() -> int:
 
 @dataclass(frozen=True)
 class Child:
-    """One child process. output: the read end of its stdout and stderr. said: read of it so far."""
+    """One child process. output: read end of its stdout and stderr. `said`: the output so far."""
 
     label: str
     popen: "subprocess.Popen[bytes]"
@@ -64,7 +64,7 @@ class Child:
     said: bytearray = field(default_factory=bytearray)
 
     def send_signal(self, number: signal.Signals) -> None:
-        """Send it a signal, but never to another process that has reused its pid."""
+        """Send the child a signal, but never another process that has reused its pid."""
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self.pidfd, number)
 

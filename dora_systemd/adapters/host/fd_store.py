@@ -74,14 +74,14 @@ def count_life(began_us: int) -> None:
 def is_first_life() -> bool:
     """Whether no life before this one has counted itself since systemd loaded the unit.
 
-    False also if systemd, older than 254, does not tell whether it keeps descriptors: $FDSTORE in
-    systemd.exec(5).
+    False also if systemd is older than 254 and does not set $FDSTORE, see systemd.exec(5): then
+    systemd may keep no descriptors.
     """
     return "FDSTORE" in os.environ and not os.environ.get("LISTEN_FDNAMES")
 
 
 def forget_lives() -> None:
-    """Restart the count. A file without a node tells the next life that it is not the first."""
+    """Restart the count. A file without a node shows the next life that it is not the first."""
     fd = os.memfd_create(PREFIX, os.MFD_CLOEXEC)
     store(fd, "")
     os.close(fd)

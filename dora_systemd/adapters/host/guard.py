@@ -1,9 +1,10 @@
-"""A child process that does what this one leaves undone when it is killed, as by SIGKILL.
+"""A child process that finishes the work of this process if this process is killed, as by SIGKILL.
 
-The out-of-memory killer, too, takes one process without a word. Only the kernel tells of it, by the
-end of a connection. The child has the lock of its parent, see flock(2), so nobody else takes it
-until it has done its work. It has a session of its own, and ignores what it can ignore, so only
-SIGKILL to the whole cgroup ends both: then nobody does the work, and the next command has to.
+The out-of-memory killer, too, kills one process without a notice. The child learns of the kill by
+the end of a connection, which the kernel closes. The child holds the lock of its parent, see
+flock(2), so no other process takes the lock before the work is finished. The child has its own
+session, and ignores all signals that can be ignored: only SIGKILL to the whole cgroup ends parent
+and child, and then the next command has to finish the work.
 """
 
 import os
@@ -15,10 +16,10 @@ from pathlib import Path
 from typing import NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Those that ask a process to end, and with it all others of its group or unit."""
+"""Signals that request the end of a process, and usually of its whole process group or unit."""
 _MORE = (signal.SIGQUIT, signal.SIGABRT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGALRM)
-"""Those that a unit or a terminal can have for that, too, see KillSignal= in systemd.kill(5). They
-end this process, as the caller wants; the child goes on."""
+"""More such signals, of a unit (see KillSignal= in systemd.kill(5)) or a terminal. They end this
+process, as the caller wants; the child ignores them."""
 
 _WORD = b"."
 
@@ -27,7 +28,7 @@ _WORD = b"."
 def guarded(end: Callable[[], None], lock: Path) -> Iterator[None]:
     """Call `end` in another process if this one is killed in the block.
 
-    lock: the lock file that it goes on to hold; it holds nothing else that is open here.
+    lock: the only open file that the child keeps, and so the lock that it continues to hold.
     """
     ours, theirs = socket.socketpair()
     child = os.fork()

@@ -1,7 +1,7 @@
-"""Tells when the entries of directories change, by inotify(7).
+"""Notices when the entries of directories change, by inotify(7).
 
-Not by watchfiles, which also hears of every open and write: in /dev that is each use of /dev/null
-by any process of the machine.
+Not by watchfiles, which also receives an event for every open and write: in /dev for each use of
+/dev/null by any process of the machine.
 """
 
 import contextlib
@@ -41,7 +41,7 @@ class Inotify:
                 self._watches[path] = self._checked(number)
 
     def drain(self) -> None:
-        """Read all events, which say only that something has changed."""
+        """Read and discard all events, because any event means only that something has changed."""
         with contextlib.suppress(BlockingIOError):
             while os.read(self.fd, _BUFFER):
                 pass

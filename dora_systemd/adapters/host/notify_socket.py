@@ -67,9 +67,9 @@ class NotifySocket:
 
 
 class Pending:
-    """A message whose sender may wait: leaving the context lets it go on, see sd_notify_barrier(3).
+    """A message whose sender may wait until the context is left, see sd_notify_barrier(3).
 
-    data: b"" if it was too long. pid: of the sender, 0 if that is not known.
+    data: b"" for a message that was too long. pid: of the sender, 0 for an unknown one.
     """
 
     def __init__(self, data: bytes, control: list[tuple[int, int, bytes]]) -> None:
@@ -92,7 +92,7 @@ class Pending:
 
     def is_there(self) -> bool:
         """Whether `pid` still is the sender. Call this after all else about it was read."""
-        if self._pidfd is None:  # an older kernel does not say
+        if self._pidfd is None:  # an older kernel sends no pidfd
             return self.pid > 0
         if self._pidfd < 0:
             return False

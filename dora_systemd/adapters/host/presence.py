@@ -58,16 +58,16 @@ def _places(path: str) -> set[str]:
 
 
 def _existing(path: str) -> set[str]:
-    """The parent of `path`, or the nearest one that exists, and the parent of that.
+    """Return the nearest existing directory above `path`, and the parent of that directory.
 
-    The latter tells when the former is moved away.
+    A watch on the parent notices when the directory is moved away.
     """
     parent = next(one for one in Path(path).parents if _is_directory(one) or one == one.parent)
     return {str(parent), str(parent.parent)}
 
 
 def _is_directory(path: Path) -> bool:
-    """Whether a directory is there; not if nobody can tell, such as without permission."""
+    """Whether `path` is a directory; False also without permission to find out."""
     return os.path.isdir(path)  # noqa: PTH112 - up to Python 3.13, is_dir() raises for EACCES
 
 

@@ -1,4 +1,4 @@
-"""Child processes: run one to its end, read what it said."""
+"""Child processes: run one to its end, read its output."""
 
 import contextlib
 import os
@@ -117,7 +117,7 @@ def _collect(streams: Sequence[int], deadline: float, command: str) -> list[byte
 
 
 def _wait(child: "Popen[bytes]", deadline: float, command: str) -> int:
-    """The exit status of a child that has closed its streams: it may go on without them."""
+    """Wait for the exit status of a child, which may run on after it has closed its streams."""
     poll, end = select.poll(), os.pidfd_open(child.pid)
     poll.register(end, select.POLLIN)
     try:

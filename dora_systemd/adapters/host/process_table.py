@@ -113,8 +113,8 @@ class LockProcess(NamedTuple):
 def read_flocks(device: int) -> Mapping[int, tuple[int, ...]]:
     """The processes with a flock(2) on files of a device (st_dev), by inode, see proc_locks(5).
 
-    A lock whose owner is in a PID namespace that the caller does not see is missing. Empty if the
-    kernel does not tell.
+    A lock whose owner is in a PID namespace that the caller does not see is missing. Empty if
+    /proc/locks cannot be read.
     """
     wanted = b"%02x:%02x" % (os.major(device), os.minor(device))
     found: defaultdict[int, tuple[int, ...]] = defaultdict(tuple)

@@ -43,7 +43,7 @@ def prove_rights(rights: Sequence[NodeRights], run: Callable[..., Completed] = r
     named = {one.node: one for one in rights}
     for node, words in rights_commands(rights, read_base()).items():
         done = run([*words, "/bin/true"], _SECONDS, _ENVIRONMENT, account=own_account())
-        # nice(1) goes on without the priority, and complains.
+        # nice(1) runs the command without the priority, and writes a warning.
         if done.status or done.stderr:
             raise _refusal(named.get(node), node, done.stderr)
 

@@ -34,10 +34,10 @@ def require_watcher(find: Callable[[str], object] = find_spec) -> None:
 
 
 class Identity(NamedTuple):
-    """What tells one version of a file from another one.
+    """The values that distinguish one version of a file from another.
 
-    Times alone do not: the clock may be set back, a server has a clock of its own, and a file that
-    is moved there is older than the one before. path: without links.
+    Times alone do not: the clock may be set back, a file server has its own clock, and a file that
+    was moved to the path may be older than the file before. path: without links.
     """
 
     path: str
@@ -211,10 +211,10 @@ def read_gitignores(root: str) -> dict[str, tuple[str, ...]]:
 async def _with_start(
     rules: WatchRules, idle_ms: int
 ) -> AsyncIterator[tuple[frozenset[str], bool]]:
-    """Yield the bursts. True stands beside the first one, and beside an early one without paths.
+    """Yield the bursts, the first one with True, and before it an early one without paths, too.
 
-    The early one comes when the watches should exist, the first one when they certainly do. The
-    bursts end where a directory has no watch, because it was created after the list was made.
+    The early burst comes when the watches should exist, the first one when they certainly do. The
+    bursts end if a directory has no watch, because it was created after the list was made.
     """
     directories = await asyncio.to_thread(watched_directories, rules)
 

@@ -35,7 +35,7 @@ def open_journalctl(
     """
     check_program("journalctl")
     environment = {**os.environ, "SYSTEMD_COLORS": "1" if want_colors else "0", "LC_ALL": "C.UTF-8"}
-    # Not a pipe: what it says of damaged files, before anybody reads it, can be more than that has.
+    # Not a pipe, which warnings about damaged files could fill before anything reads it.
     complaints = os.fdopen(os.memfd_create("journalctl"), "rb")
     try:
         child = subprocess.Popen(

@@ -29,7 +29,7 @@ def send_note(entry: bytes, path: str = JOURNAL_SOCKET) -> None:
 def note_request(event: str, name: str, uuid: str, command: str, **details: str) -> None:
     """Write an event about a dataflow in the name of this process.
 
-    command: by which it is asked, such as "doractl stop". details: as in event_fields().
+    command: that makes the request, such as "doractl stop". details: as in event_fields().
     """
     by = requester(command)
     fields = event_fields(event, dataflow=name, by=by, **details)
@@ -43,7 +43,7 @@ def requester(command: str) -> str:
 
 
 def caller(uid: int, environ: Mapping[str, str]) -> str:
-    """A user's name; root by sudo(8) is told with the one who called it."""
+    """Format a user's name; for root by sudo(8) with the name of the user who called sudo."""
     name = user_name(uid, nameless="the user ")
     behind = environ.get("SUDO_USER", "")
     return f"{name}, by sudo of {behind}" if uid == 0 and behind not in ("", "root") else name

@@ -55,9 +55,9 @@ class LogPipes:
         self._paths: dict[str, CellPaths] = {}
         self._sources: dict[str, Source] = {}
         self._outputs: dict[int, LineSplitter] = {}
-        self.left_out: tuple[bytes, ...] = ()  # what their lines say that are no records
+        self.left_out: tuple[bytes, ...] = ()  # lines that contain one of these are left out
         self._muted: frozenset[str] = frozenset()
-        self._asked: set[str] = set()  # nodes whose end somebody has asked for
+        self._asked: set[str] = set()  # nodes whose end was requested
         self._lost = 0
 
     def make(self, node_id: str, paths: CellPaths) -> None:
@@ -138,7 +138,7 @@ class LogPipes:
             source.renew(run=run_id)
 
     def drain(self, node_id: str, is_live: bool = False) -> None:
-        """Queue what is in a node's pipes, before an event. is_live: its last line may go on."""
+        """Queue what is in a node's pipes, before an event. is_live: with a partial last line."""
         source = self._source(node_id)
         for pipe in source.pipes:
             # Above the limit while journald takes nothing: the lines are safe in the pipe.

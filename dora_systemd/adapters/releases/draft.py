@@ -27,8 +27,8 @@ _LEAST_SHARE = 20
 class Draft:
     """A release of `store` without a name yet. All methods raise OSError.
 
-    kind: in the name of its directory. damaged: the files of another release that could not be
-    shared, because they are not as its manifest says.
+    kind: part of the directory's name. damaged: the files of another release that could not be
+    shared, because they differ from that release's manifest.
     """
 
     def __init__(self, store: Store, kind: str = "new") -> None:

@@ -81,7 +81,7 @@ class Store:
         return parse_manifest(text, str(path))
 
     def intact(self, manifest: Manifest) -> dict[str, Stored]:
-        """The files of a release that still are as its manifest says."""
+        """Return the files of a release that are unchanged since its manifest was written."""
         tree = self.tree(manifest.id)
         return {path: one for path, one in manifest.files.items() if one == stored_at(tree / path)}
 

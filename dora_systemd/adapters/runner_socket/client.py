@@ -49,9 +49,9 @@ def order(path: Path, request: Request, seconds: float = RELAY_SECONDS) -> dict[
 
 
 def ask_refusal(path: Path) -> DoraSystemdError | None:
-    """The error that a start of the dataflow of the runner at `path` would end with, or None.
+    """Return the error with which the runner at `path` could not start its dataflow, or None.
 
-    Raises DoraSystemdError if the runner does not say.
+    Raises DoraSystemdError if the runner does not answer.
     """
     reply = order(path, {"verb": "check"})
     refused = reply.get("refused")
@@ -92,7 +92,10 @@ def relay(path: Path) -> tuple[socket.socket, str]:
 
 
 def done_of(path: Path, reply: Request) -> list[str]:
-    """What the runner at `path` reports to have done, for people. Raises DoraSystemdError."""
+    """Return the human-readable results that the runner at `path` reports.
+
+    Raises DoraSystemdError.
+    """
     done = reply.get("done")
     if not isinstance(done, list) or not all(isinstance(one, str) for one in done):
         raise _unreadable(path)

@@ -18,7 +18,7 @@ _SECONDS = 0.5
 """For a request: only the user of the nodes and root can connect."""
 _CHUNK = 1 << 16
 Greet = Callable[[bytes], tuple[bytes, bytes]]
-"""What to answer to a line, b"" for nothing yet, and what is to be taken for that line later."""
+"""Returns the answer to a line, b"" for nothing yet, and what replaces the line from then on."""
 
 
 def listen(path: Path) -> socket.socket:
@@ -44,14 +44,14 @@ def _short(path: Path) -> Iterator[str]:
 
 
 class Kept(NamedTuple):
-    """A connection. said: what has been read of it."""
+    """A connection. `said`: the bytes that were received."""
 
     connection: socket.socket
     said: bytes
 
 
 class Door:
-    """Listens at `path`, and greets, until hand_over(). Raises OSError."""
+    """Listens at `path` and answers by `greet`, until hand_over(). Raises OSError."""
 
     def __init__(self, path: Path, greet: Greet) -> None:
         self._listener, self._greet = listen(path), greet

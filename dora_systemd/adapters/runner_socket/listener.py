@@ -1,4 +1,4 @@
-"""The runner's socket in the RuntimeDirectory; client.py says who can access it.
+"""The runner's socket in the RuntimeDirectory; client.py documents who can access the socket.
 
 A relay request turns the connection into one to the coordinator, whatever network the cell has.
 """

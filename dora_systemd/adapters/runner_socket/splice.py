@@ -39,14 +39,17 @@ class Ends(NamedTuple):
 
 
 async def taken_over(connection: socket.socket, said: bytes, limit: int) -> Ends:
-    """A connection that was there before the loop. said: has been read. limit: bytes of a line."""
+    """Wrap a connection that is older than the event loop.
+
+    `said`: the bytes that were already received. limit: maximum bytes of a line.
+    """
     loop = asyncio.get_running_loop()
     reader = asyncio.StreamReader(limit, loop)
     reader.feed_data(said)
     protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
     connection.setblocking(False)
     with contextlib.suppress(OSError):
-        # The other side may have said its last word: a write would fail, and nobody read that.
+        # The other side may have ended already: after a failed write its last bytes would be lost.
         reader.feed_data(connection.recv(_CHUNK))
     transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection)
     return Ends(reader, asyncio.StreamWriter(transport, protocol, reader, loop))
