@@ -69,7 +69,7 @@ def joined(directory: str, name: str) -> str:
 
 
 class Rules:
-    """What a release leaves out: `always` anywhere, and what .gitignore says in its directory.
+    """Files that a release leaves out: `always` anywhere, and what each .gitignore lists.
 
     libraries: the directory that has pathspec.
     """

@@ -12,7 +12,7 @@ import sys
 
 _PART = 32 * 1024
 _HEAD = 256
-"""Bytes of a program that say how it is executed."""
+"""Bytes at the head of a program that determine how the kernel executes it."""
 _MOST_ENTRIES = 10_000
 _MOST_NAMES = 16
 

@@ -69,7 +69,7 @@ def read_file(path: str | Path, max_bytes: int = MAX_BYTES) -> Text:
 
 
 def read_own_file(path: str | Path) -> bytes:
-    """The same for a file that the caller has named: links are followed, whosever they are."""
+    """Like read_file(), for a path given by the caller: follows symbolic links of any owner."""
     try:
         data = read_regular(path, MAX_BYTES + 1)
     except (OSError, ValueError) as error:
@@ -162,7 +162,7 @@ def read_table(directory: Path) -> CellStatus | None:
 def read_times(directory: Path, size: int) -> bytes:
     """The file of times in a RuntimeDirectory; b"" if it is not usable, or has more than `size`.
 
-    decisions/owes/probe.py says what is in it.
+    decisions/owes/probe.py documents the content.
     """
     try:
         return _read(CellPaths(directory).times, size) or b""

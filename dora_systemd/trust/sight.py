@@ -1,9 +1,9 @@
 """Checks paths that another user names with that user's permissions: root could see too much.
 
 A child process takes on the account and answers; it runs only the few lines of eyes.py. The account
-can stop and trace the child and make it lie, so callers trust an answer no more than the account
-itself. The child may also take nothing and say nothing: so send() and receive() wait no longer than
-the caller wants.
+can stop and trace the child and forge its answers, so callers trust an answer no more than the
+account itself. The child may also read nothing and send nothing: so send() and receive() wait no
+longer than the caller wants.
 """
 
 import contextlib
@@ -90,7 +90,7 @@ class Sight:
     def _ask(self, letter: bytes, path: str) -> bytes:
         try:
             return eyes.answer(letter, os.fsencode(path), MAX_BYTES + 1)
-        except ValueError as error:  # a path with a null character; the child of a user says that
+        except ValueError as error:  # a path with a null character, as the child reports it, too
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
 
 

@@ -71,7 +71,7 @@ def find_owner(
     """The owner of the socket that is bound to `peer` and connected to `own`.
 
     Reading the table takes milliseconds. A client that connects and disconnects at once must not
-    cause a reading each time. ask, read: ask the kernel, and read the table.
+    cause a reading each time. `ask`: queries the kernel. `read`: reads the table.
     """
     ask, read = ask or _ask_kernel, read or read_owner
     try:
@@ -138,9 +138,9 @@ def _listeners(port: int, tables: tuple[Path, ...]) -> Iterator[list[bytes]]:
 
 
 def _ask_kernel(peer: Address, own: Address) -> Owner:
-    """Ask the kernel by sock_diag(7).
+    """Query the kernel by sock_diag(7).
 
-    Raises OSError if it does not support that or has no such socket.
+    Raises OSError if the kernel does not support sock_diag or has no such socket.
     """
     family, source, target = _family(peer), _packed(peer), _packed(own)
     identity = struct.pack("!HH16s16sI8s", peer[1], own[1], source, target, 0, _NO_COOKIE)
