@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 REACHED_AS = "DORACTL_REACHED_AS"
-"""The variable that tells doractl on another host by what -H it was called."""
+"""The variable with the -H of the caller, for doractl on that host."""
 
 
 class ExitCode(IntEnum):
@@ -72,7 +72,7 @@ class WrongKey(DoraSystemdError):
 
 
 class TimedOut(DoraSystemdError):
-    """A check took too long. It says nothing of what was checked, so a restart may help."""
+    """A check took too long, which proves nothing about its subject: a restart may help."""
 
 
 class RestartsSpent(DoraSystemdError):
@@ -80,7 +80,7 @@ class RestartsSpent(DoraSystemdError):
 
 
 def words_of(error: Exception) -> str:
-    """What an exception says, in the words of errno(3) alone if it has such a number."""
+    """Return the text of an exception; for one with an errno(3) only the text of that number."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return str(error) or type(error).__name__

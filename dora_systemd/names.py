@@ -94,7 +94,7 @@ PLAIN_STEM = "dataflow"
 
 
 def settings_path(dataflow: str) -> str:
-    """The settings file beside a dataflow file, which may not exist."""
+    """Return the path of the settings file next to a dataflow file; the file may not exist."""
     path = PurePath(dataflow)
     return str(path.with_name(f"{path.stem}.systemd.yml"))
 
@@ -128,7 +128,7 @@ def name_from_unit(unit: str) -> str | None:
 
 
 def unit_description(name: str, uuid: str, release: str = "") -> str:
-    """Description= of the unit: systemd lists it with the units, so `list` need not ask for it."""
+    """Description= of the unit, which systemd lists with the units: `list` needs no request."""
     return f"dora dataflow {name} ({uuid})" + (f", release {release}" if release else "")
 
 

@@ -23,7 +23,7 @@ class CellPaths:
         self.socket = root / "runner.sock"
         """The socket where the runner answers doractl, and relays to the coordinator."""
         self.times = root / "times"
-        """When the owed outputs of nodes were heard, see decisions/owes/probe.py."""
+        """The times of the last messages of owed outputs, see decisions/owes/probe.py."""
         self.settings = root / "settings.yml"
         """The version of the dataflow's settings file that is in use."""
         self.lock = root / "inhibit.lock"

@@ -3,7 +3,7 @@
 The checks report errors in one line for which dora prints ten lines, or nothing: `nodes: []` would
 run forever, and only `dora validate` finds an input without a source. dora checks everything else.
 
-Also here: which nodes depend on which, and what `dora build` saves beside the descriptor.
+Also here: which nodes depend on which, and what `dora build` saves next to the descriptor.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

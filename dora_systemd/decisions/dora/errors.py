@@ -71,7 +71,7 @@ _NUMBERS = ("queue_size", "input_timeout")
 
 
 def name_input(reason: str, document: Any) -> str:
-    """An error of dora with the input and its value, as far as they can be told.
+    """Return an error of dora with the name and the value of the bad input, if they can be found.
 
     document: the dataflow file.
     """

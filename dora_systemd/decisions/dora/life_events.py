@@ -45,7 +45,7 @@ def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
 
 
 def is_note_of_stale(record: LogRecord) -> bool:
-    """Whether dora says that the exit before was of a process that it has replaced or removed."""
+    """Return whether dora reports that the last exit was of a replaced or removed process."""
     return record.target == "daemon" and record.message.startswith(_STALE)
 
 

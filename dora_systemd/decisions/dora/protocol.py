@@ -129,7 +129,7 @@ def wait_spawn_params(run: str) -> Params:
 
 
 def check_params(run: str) -> Params:
-    """Ask whether the run has ended, and how."""
+    """Query whether the run has ended, and how."""
     return {"Check": {"dataflow_uuid": run}}
 
 
@@ -167,7 +167,7 @@ def parse_heartbeat(reply: Reply) -> int:
     """µs since the last heartbeat of this machine's daemon, from the reply to CONNECTED_DAEMONS.
 
     Of several machines this is the head. INFINITY if its daemon is not connected, 0 if the reply
-    does not tell.
+    does not contain the time.
     """
     if not isinstance(as_mapping(reply.result).get("ConnectedDaemons"), list):
         return 0
@@ -175,10 +175,10 @@ def parse_heartbeat(reply: Reply) -> int:
 
 
 def parse_heartbeats(reply: Reply) -> list[tuple[str, int]]:
-    """The machine of each daemon in the reply to CONNECTED_DAEMONS, and µs since it was heard.
+    """The machine of each daemon in the reply to CONNECTED_DAEMONS, and µs since its heartbeat.
 
-    "" is a machine without a name. A daemon of which the reply does not tell it has 0. A machine
-    that is back can be there twice.
+    "" is a machine without a name. 0 stands for a daemon whose time the reply does not contain. A
+    machine that has reconnected can occur twice.
     """
     daemons = as_list(as_mapping(reply.result).get("ConnectedDaemons"))
     return [(_machine_of(one), _silence_of(one)) for one in map(as_mapping, daemons)]
@@ -223,7 +223,7 @@ def parse_results(reply: Reply) -> dict[str, Exit] | None:
 def parse_spawn_failure(reply: Reply) -> str:
     """The reply to WaitForSpawn: "", or why a node could not be executed.
 
-    A run that dora no longer knows was executed and has ended: its life events tell how.
+    A run that dora no longer knows was executed and has ended: its life events report how.
     """
     return "" if _ENDED_ALREADY.match(reply.error) else first_line(reply.error)
 

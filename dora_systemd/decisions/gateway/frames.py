@@ -197,7 +197,7 @@ def _changed_env(sent: Mapping[str, Any], written: Mapping[str, Any]) -> tuple[s
     old = {key: scalar_text(value) for key, value in written.items()}
     new = {key: scalar_text(value) for key, value in sent.items()}
     for key in [key for key, value in sent.items() if value is None]:
-        # JSON has no such numbers, so dora sends null; what the file says is read from there.
+        # JSON has no such numbers, so dora sends null; the runner reads the value from the file.
         if not is_infinite(old.get(key, "")):
             raise DoraSystemdError(
                 f"cannot start: env {quoted(key)} is infinite or not a number, and dora lost it",

@@ -74,7 +74,7 @@ _BEARER = "bearer "
 class Door:
     """Counts connections, and always keeps room for root and for the gateway's owner.
 
-    uid: the user at the other end of a connection, None if the kernel does not tell.
+    uid: the user at the other end of a connection, None if the kernel does not know.
     """
 
     def __init__(self, own_uid: int) -> None:
@@ -118,7 +118,7 @@ def refuse_address(hosts: Sequence[str], origins: Sequence[str] = ()) -> Answer 
 def refuse_user(uid: int | None, own_uid: int) -> Answer | None:
     """Let in root and the gateway's own user, if no token lets the caller in.
 
-    uid: the user at the other end of the connection, None if the kernel does not tell.
+    uid: the user at the other end of the connection, None if the kernel does not know.
     """
     if uid in (0, own_uid):
         return None

@@ -10,7 +10,7 @@ unit's Restart= applies.
     booting    the coordinator's port, 30 s                      starts the daemon
     joining    the daemon's registration                         sends the descriptor
     gathering  a head: its members; a member: the head's run     sends it, or subscribes
-    starting   the run id and the event subscription             opens the pipes, launchers go on
+    starting   the run id and the event subscription             opens the pipes: nodes start
     waiting    dora's start barrier                              READY=1
     running    the end of the run, or a stop request             fetches the result, or stops
     stopping   Stop's answer, the last node, 1.5 x grace + 2 s   dismisses the daemon

@@ -59,5 +59,5 @@ _RESULTS = {
 
 
 def result_words(result: str) -> str:
-    """What a Result= of systemd means, "" if the end of the main process says more."""
+    """Explain a Result= of systemd; "" if the exit of the main process explains more."""
     return UNIT_RESULTS[result][1] if result in UNIT_RESULTS else _RESULTS.get(result, "")

@@ -1,7 +1,7 @@
 """Nodes that end before they have called dora, and those that fail for it: see handlers.py. Pure.
 
 dora then fails every node that waits at the start barrier, whatever the exit status of the first
-one was. Its name is in what dora says of the others, and of nothing that dora says of itself.
+node was. dora names the first node only in its errors about the other nodes.
 """
 
 from collections.abc import Mapping

@@ -131,7 +131,7 @@ class NodeSpeaks(Event):
 
 @dataclass(frozen=True)
 class NodeLacks(Event):
-    """The node must not run: something that it needs is missing. needs: what, for people."""
+    """The node must not run: something that it needs is missing. needs: what (human-readable)."""
 
     node: str
     needs: str
@@ -139,7 +139,7 @@ class NodeLacks(Event):
 
 @dataclass(frozen=True)
 class NodeMet(Event):
-    """Everything that the node needs is there: its launcher goes on."""
+    """Everything that the node needs exists: its launcher starts the node."""
 
     node: str
 
@@ -192,7 +192,7 @@ class StopAnswered(Event):
 
 @dataclass(frozen=True)
 class NodeAsked(Event):
-    """Somebody has asked for a restart or a stop of one node; it follows."""
+    """A restart or a stop of one node was requested, and follows."""
 
     node: str
     what: str  # RESTART or STOP of cell/status.py
@@ -239,7 +239,7 @@ class ReloadAsked(Event):
 
 @dataclass(frozen=True)
 class MachinesAwaited(Event):
-    """Some member is not there. text: which one and why, for people."""
+    """A member is not connected. text: which one and why (human-readable)."""
 
     text: str
 
@@ -268,14 +268,14 @@ class MachineLost(Event):
 
 @dataclass(frozen=True)
 class HeadStops(Event):
-    """To a member: the head has dora stop all nodes. by: who asked for it there."""
+    """To a member: the head has dora stop all nodes. by: who requested the stop of the head."""
 
     by: str
 
 
 @dataclass(frozen=True)
 class HeadLost(Event):
-    """To a member: it is alone, or has to end its nodes by itself."""
+    """To a member: the head is lost, or requests that the member end its nodes without dora."""
 
     reason: str
 

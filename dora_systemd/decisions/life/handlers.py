@@ -61,7 +61,8 @@ def started(cell: Cell, event: life.RunStarted) -> Next:
 def subscribed(cell: Cell, event: life.Event) -> Next:
     """The subscription is active: no event of a node gets lost from here on."""
     # Launchers wait for OPEN_PIPES, so their nodes cannot end before this. Nodes that dora starts
-    # without a launcher can, and no event would say so: ASK_RESULT asks whether the run has ended.
+    # without a launcher can, and no event would report that: ASK_RESULT queries whether the run has
+    # ended.
     return to(cell, State.WAITING, Do.OPEN_PIPES, Do.ASK_SPAWN, Do.ASK_RESULT)
 
 
@@ -81,10 +82,10 @@ def run(cell: Cell, event: life.Event) -> Next:
 
 
 def start_timed_out(cell: Cell, event: life.StartTimedOut) -> Next:
-    """The start fails and names the nodes that are not ready.
+    """Fail the start, and name the nodes that are not ready.
 
     The time in which a node waits for what it needs does not count: the runner starts a new timeout
-    when it goes on.
+    when the wait ends.
     """
     if table.lacking(cell.nodes) or event.at_us < cell.met_us:
         return cell, ()
@@ -115,7 +116,7 @@ def node_event(cell: Cell, event: life.Event) -> Next:
 
 
 def node_met(cell: Cell, event: life.NodeMet) -> Next:
-    """The node goes on, and has the whole start timeout again."""
+    """End the wait of a node for its needs, and give it the whole start timeout again."""
     return node_event(replace(cell, met_us=event.at_us), event)
 
 
@@ -124,7 +125,7 @@ def _is_stopping(cell: Cell) -> bool:
 
 
 def stop_early(cell: Cell, event: life.StopAsked) -> Next:
-    """Stop before the launchers go on: end at once, and EXIT kills what there is."""
+    """Stop before the launchers have started nodes: end at once; EXIT kills all processes."""
     cell = replace(cell, stop_by=event.by)
     return to(cell, State.ENDED, _stopping(event), Record("dataflow-stopped"), Do.EXIT)
 
@@ -216,7 +217,7 @@ def _fail_early(cell: Cell, node: str, actions: tuple[Action, ...]) -> Next:
 
 
 def run_finished(cell: Cell, event: life.Event) -> Next:
-    """All nodes have exited: ask dora for the result."""
+    """Request the result from dora, because all nodes have exited."""
     return to(cell, State.CLOSING, Do.ASK_RESULT, after=ENGINE_TIMEOUT)
 
 
@@ -283,7 +284,7 @@ def _exit_of_stop(cell: Cell) -> RunnerExit:
 
 
 def _has_failed_at_stop(node: NodeStatus, grace_ends_us: int) -> bool:
-    if is_stopped(node):  # before, by somebody who asked for it
+    if is_stopped(node):  # by an earlier request for this node
         return False
     is_late = node.state == "stopped" and node.since_us >= grace_ends_us
     return node.exit.is_failure and not (is_late and node.exit.is_terminated)
@@ -319,8 +320,8 @@ def _is_replaced(cell: Cell, node: NodeStatus) -> bool:
     """Whether this is the first process after a reload: the reloader goes back if it fails.
 
     While the dataflow runs, only such a process has never been ready and is no restart of dora's.
-    With a notice the reload is over: the process was too slow for it. After a restart that somebody
-    asked for nothing goes back.
+    With a notice the reload is over, because the process was too slow. A requested restart of a
+    node has no earlier version to return to.
     """
     return node.state == "starting" and not (node.restarts or cell.notice or node.asked)
 
@@ -328,17 +329,18 @@ def _is_replaced(cell: Cell, node: NodeStatus) -> bool:
 def _is_lost(cell: Cell, ident: str) -> bool:
     """Whether a node has failed for good.
 
-    With the policy HELD it waits for a reload. With LATCHED it is not clear yet: a device that it
-    needs may be gone, and if not, its launcher exits in its place.
+    With the policy HELD a failed node waits for a reload. With LATCHED the end is not final yet: a
+    device that the node needs may be gone, and if not, its launcher exits in its place.
     """
     node = cell.nodes.get(ident)
     return node is not None and node.state == "failed" and node.policy not in (HELD, LATCHED)
 
 
 def _without(cell: Cell, node: str, actions: tuple[Action, ...]) -> Next:
-    """The dataflow ends because of this essential node.
+    """End the dataflow because of this essential node.
 
-    Without restarts left the unit is not restarted either: that would be more than the policy says.
+    A node without restarts left must not get more by a restart of the unit: the exit status
+    prevents that.
     """
     spent = table.spent(cell.nodes)
     reason = f"{ESSENTIAL}node {node}: {spent.get(node) or cell.nodes[node].exit}"
@@ -348,7 +350,7 @@ def _without(cell: Cell, node: str, actions: tuple[Action, ...]) -> Next:
 
 
 def silent(cell: Cell, event: life.NodeSilent) -> Next:
-    """A node owes an output: record it, and end the dataflow if that is asked."""
+    """Record that a node owes an output, and end the dataflow if the setting requires it."""
     cell, actions = node_event(cell, event)
     if event.then != FAIL:
         return cell, actions

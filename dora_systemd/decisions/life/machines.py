@@ -1,10 +1,10 @@
 """The handlers of what is different if a dataflow has several machines, see handlers.py.
 
-A lost machine is a lost run: dora cannot go on without one of its daemons, and to ask it to stop
-then takes half a minute. So each machine ends its own nodes. With a restart policy the head waits
-for the machine, and starts the next run in the same process: a restart by systemd would use up
-StartLimitBurst=, and lengthen the delay of the next one. The failure of a part is a failure of the
-dataflow, which systemd restarts.
+A lost machine is a lost run: dora cannot continue without one of its daemons, and a Stop then takes
+half a minute. So each machine ends its own nodes. With a restart policy the head waits for the
+machine, and starts the next run in the same process: a restart by systemd would use up
+StartLimitBurst=, and lengthen the delay of the next restart. The failure of a part is a failure of
+the dataflow, which systemd restarts.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ _ENDED = ("failed", "finished", "stopped", "dynamic")
 
 
 def boot_deadline(cell: Cell, event: life.DeadlinePassed) -> Next:
-    """Nothing has come of the first step: of a member, nobody has told it what to run."""
+    """Fail, because the first step timed out. For a member: the head has not sent its Part."""
     if not cell.machine:
         return engine_deadline(cell, event)
     reason = f"no head has said what to run within {ENGINE_TIMEOUT // SECOND} s"
@@ -38,7 +38,7 @@ def boot_deadline(cell: Cell, event: life.DeadlinePassed) -> Next:
 
 
 def joined(cell: Cell, event: life.DaemonConnected) -> Next:
-    """The daemon has registered: wait for the other machines, if there are any."""
+    """Wait for the other machines, if there are any, after the daemon has registered."""
     if not cell.members and not cell.machine:
         return handle.joined(cell, event)
     return to(cell, State.GATHERING, Do.GATHER)
@@ -132,7 +132,7 @@ def _without_others(cell: Cell, at_us: int) -> table.NodeTable:
 
 
 def head_stops(cell: Cell, event: life.HeadStops) -> Next:
-    """Dora is about to end the nodes, and nobody here has to ask it."""
+    """Wait for the nodes to end, which dora stops at the request of the head."""
     cell = replace(cell, stop_by=event.by)
     if not table.has_process(cell.nodes):
         return handle.wind_down(cell, _stopping(event.by))
@@ -140,7 +140,7 @@ def head_stops(cell: Cell, event: life.HeadStops) -> Next:
 
 
 def head_lost(cell: Cell, event: life.HeadLost) -> Next:
-    """A member alone: end the nodes, and with success, for the head decides what follows."""
+    """End the nodes of a member without a head, and exit with success: the head decides more."""
     cell = replace(cell, stop_by=HEAD)
     return _end_nodes(cell, event, _lost(HEAD, event.reason), _stopping(HEAD))
 

@@ -60,7 +60,7 @@ def update(
     """
     after, record = _changed(nodes, event, is_stopping, is_open)
     own, restarted = [record] if record else [], _restarted(nodes, after)
-    # A stale exit was before the restart. What else tells of a restart comes from the new process.
+    # A stale exit was before the restart. All other events of a restart are of the new process.
     is_stale = isinstance(event, life.NodeExited) and event.is_stale
     return after, (*own, *restarted) if is_stale else (*restarted, *own)
 
@@ -107,7 +107,7 @@ def _set(nodes: NodeTable, ident: str, at_us: int, **changes: str | int | Exit) 
 
 def _ready(nodes: NodeTable, event: life.NodeReady, is_open: bool) -> Change:
     old, record = nodes.get(event.node, NodeStatus()), Record("node-ready", event.node)
-    if is_stopped(old):  # dora has told it to end meanwhile
+    if is_stopped(old):  # dora has stopped the node meanwhile
         return nodes, record
     fresh: dict[str, int | str] = {"restarts": _count(old), "asked": "", "asked_by": ""}
     state = "running" if is_open else "ready"
@@ -134,7 +134,7 @@ def _reloading(nodes: NodeTable, event: life.NodeReloading) -> NodeTable:
 
 
 def _asked(nodes: NodeTable, event: life.NodeAsked) -> Change:
-    """A restart or stop of a node was asked for: its process is about to end."""
+    """Record a requested restart or stop of a node, whose process is about to end."""
     if event.node not in nodes:
         return nodes, None
     old = nodes[event.node]
@@ -170,9 +170,9 @@ def held(nodes: NodeTable) -> dict[str, NodeStatus]:
 
 
 def is_over_but_for_held(nodes: NodeTable) -> bool:
-    """Whether all nodes have ended, but for some that somebody has stopped and that may come back.
+    """Return whether all nodes have ended, except stopped ones that may start again.
 
-    If nothing else has ended, somebody has stopped all of them, and the dataflow goes on.
+    False if all nodes were stopped by requests: then the dataflow stays running.
     """
     own = [node for node in nodes.values() if not is_stopped(node)]
     is_over = all(node.state in ("finished", "failed") for node in own)
@@ -191,7 +191,7 @@ def _needs(nodes: NodeTable, event: life.NodeLacks | life.NodeMet) -> Change:
 
 def _lacks(nodes: NodeTable, event: life.NodeLacks) -> Change:
     old = nodes.get(event.node, NodeStatus())
-    # Its end is told as a wait: what was wrong with it before is over.
+    # The end of the node is shown as a wait: its earlier faults are over.
     ended: dict[str, str | int] = {"hung": "", "silent": "", "is_ended": False}
     nodes = _set(nodes, event.node, event.at_us, state="waiting", needs=event.needs, **ended)
     if old.state == "waiting":
@@ -229,10 +229,10 @@ def _heard(nodes: NodeTable, event: life.NodeSilent | life.NodeSpeaks) -> Change
 
 
 def _count(old: NodeStatus) -> int:
-    """The restarts of a node of which a process was heard.
+    """Return the restarts of a node, with the present one if dora reports a new process.
 
-    Counted only then: a node that is stopped before is not restarted. That the process was executed
-    may be said before the exit of the one before, so any word of it counts.
+    Not counted before: a node that is stopped meanwhile is not restarted. Any event of the new
+    process counts, because dora may report its execution before the exit of the old process.
     """
     return old.restarts + (old.state == "restarting")
 
@@ -300,7 +300,7 @@ def _is_of_another(old: NodeStatus, event: life.NodeExited) -> bool:
 
 
 def _exited_as_told(nodes: NodeTable, event: life.NodeExited, old: NodeStatus) -> Change:
-    """Somebody has asked for this end, or a reload needs it: whatever the exit, it is no crash."""
+    """Record an end that was requested or is part of a reload: no exit status is a crash then."""
     asked = {"asked": old.asked} if old.asked else {}
     record = Record("node-exited", event.node, {**event.exit.details(), **asked})
     if old.is_held:  # its launcher, which has no end of its own

@@ -100,7 +100,7 @@ class Cell:
     is_trial: bool = False  # whether the version before can come back
     reload: bool = False  # whether the run ends for the next one in this process
     notice: str = ""  # the result of the last reload
-    # whether it belongs to `doractl run`, which tells how the nodes ended after a stop, too
+    # whether it belongs to `doractl run`, which reports how the nodes ended also after a stop
     is_attached: bool = False
     met_us: int = 0  # when a node last got what it needs
     machine: str = ""  # the name of this machine if it is a member

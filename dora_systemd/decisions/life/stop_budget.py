@@ -15,7 +15,7 @@ LEAVE_TIMEOUT = 2 * SECOND
 
 
 def kill_delay(grace: int) -> int:
-    """The time after which dora kills a node that it has told to stop."""
+    """Return the time after which dora kills a node that does not stop."""
     return grace + grace // 2
 
 

@@ -1,4 +1,4 @@
-"""What people need not read twice: lines that repeat, and what an event says already. Pure."""
+"""Finds lines not worth showing: repeated ones, and those that an event covers already. Pure."""
 
 import re
 from collections.abc import Collection
@@ -26,13 +26,13 @@ def repeated(text: str, times: int) -> str:
 
 
 def is_end_of(text: str, nodes: Collection[str]) -> bool:
-    """Whether a line of dora's daemon, as it is recorded, says that one of `nodes` has failed."""
+    """Return whether a recorded line of dora's daemon reports that one of `nodes` has failed."""
     match = _END_OF_NODE.search(text) if nodes else None
     return match is not None and match[1] in nodes
 
 
 def is_told_by_event(origin: bytes, text: bytes) -> bool:
-    """Whether a line tells of the end of a node, which a life event does too.
+    """Return whether a line reports the end of a node, which a life event reports too.
 
     origin: "daemon", or with the name of the dataflow before a slash.
     """

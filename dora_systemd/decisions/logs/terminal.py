@@ -27,7 +27,7 @@ _COLORS = (32, 34, 35, 36, 92, 94, 95, 96)
 # Colours of messages by PRIORITY, as in journalctl.
 _MESSAGE_COLORS = {b"3": b"\x1b[0;1;31m", b"4": b"\x1b[0;1;38:5:185m", b"7": b"\x1b[0;38:5:245m"}
 MAX_WIDTH = 24
-# What is kept of what was said: a node can write to the journal under any name, without end.
+# Names whose last line is kept: a node can write to the journal under any number of names.
 MOST_NAMES = 2000
 _LONGEST_NAME = MAX_NAME + 1 + MAX_NODE_ID
 _LONGEST_TEXT = 16 * 1024
@@ -37,14 +37,14 @@ _MARK = b"\0"
 
 @dataclass
 class _Said:
-    """What a node has said last: how its line begins, the rest, and how often it came."""
+    """The last line of a node: its beginning, its rest, and how often the line was repeated."""
 
     start: bytes = b""
     text: bytes = b""
     times: int = 1
 
     def ending(self) -> bytes:
-        """What is still to be shown of the repetitions."""
+        """Format the line that counts the repetitions; b"" without any."""
         again = repeated(self.text.decode("utf-8", "replace").rstrip("\n"), self.times)
         return self.start + again.encode() + b"\n" if again else b""
 
@@ -59,7 +59,7 @@ class TerminalLines:
 
     nodes: known names, for the width of their column. want_dataflow: show the name of the dataflow.
     want_colors: for nodes and priorities. is_terminal: escape control characters. has_events: the
-    life events are among the lines, so what dora's daemon says of them is left out.
+    life events are among the lines, so lines of dora's daemon about the same ends are left out.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class TerminalLines:
         self._old_indent = self._new_indent = 0
 
     def feed(self, data: bytes) -> bytes:
-        """The lines that `data` completes, rewritten, but for the last record, which may go on."""
+        """Rewrite the lines that `data` completes, except the last record, which may be partial."""
         shown = self._whole.feed(data)
         if not self._want_colors:
             shown = COLOR_BYTES.sub(b"", shown)
@@ -95,12 +95,12 @@ class TerminalLines:
         return before + self._without_repeats(parts[:-3])
 
     def flush(self) -> bytes:
-        """The rest: the last record, and how often the last line of each node came."""
+        """Return the rest: the last record, and how often the last line of each node came."""
         last, self._last = self._without_repeats(self._last), []
         return last + self._endings()
 
     def _endings(self) -> bytes:
-        """Forget what was said; what is still to be shown of it."""
+        """Discard the last lines of all nodes; return the lines that count their repetitions."""
         said, self._said = self._said, {}
         return b"".join(one.ending() for one in said.values())
 

@@ -1,4 +1,4 @@
-"""What a machine says of itself to whoever wants to have it as a member. Pure."""
+"""The description that a machine sends to a head that may use it as a member. Pure."""
 
 import json
 from collections.abc import Iterator, Mapping

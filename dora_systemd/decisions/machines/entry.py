@@ -1,8 +1,8 @@
-"""An entry of `machines:`: what it says about one machine, and its lines in a config.yml. Pure.
+"""An entry of `machines:`: the values for one machine, and their lines in a config.yml. Pure.
 
     gpu: {host: alice@gpu-box, directory: /home/alice/robot, venv: /opt/vision, memory_limit: 8G}
 
-Paths in it are paths on that machine; relative ones start in its directory.
+Paths in an entry are paths on that machine; relative ones start in the entry's directory.
 
 Lines are added and removed without a YAML library, so that all others stay as they are. The caller
 reads the result again, and compares: YAML has more forms than these.

@@ -1,7 +1,7 @@
-"""The key of a machine, with which a link can log in there and do nothing else. Pure.
+"""The key of a machine, which only allows a link to log in and to run its part. Pure.
 
-See AUTHORIZED_KEYS FILE FORMAT in sshd(8). sshd runs the forced command, and puts what the link has
-asked for into a variable.
+See AUTHORIZED_KEYS FILE FORMAT in sshd(8). sshd runs the forced command, and puts the command that
+the link requested into a variable.
 """
 
 import re
@@ -51,7 +51,7 @@ def _public(text: str) -> str:
 
 
 def forced_words(original: str) -> tuple[str, list[str]]:
-    """The mark to print, and the arguments of doractl, from what the link has asked for.
+    """Parse the command that the link requested: the mark to print, the arguments of doractl.
 
     Raises DoraSystemdError (USAGE) for everything that is no part of a dataflow.
     """

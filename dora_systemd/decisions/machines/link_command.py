@@ -1,7 +1,8 @@
 """The command line of a link, and that of its ssh(1). Pure.
 
-doractl writes the first one: nobody who runs nodes can tell root on another machine what to run.
-The link is a process for as long as the dataflow runs: imports only what is small.
+doractl writes the command line of a link, so that the user of the nodes cannot choose what root
+runs on another machine. The link is a process for as long as the dataflow runs: this module imports
+only what is small.
 """
 
 from collections.abc import Sequence
@@ -84,11 +85,11 @@ def parse_link_argv(arguments: Sequence[str]) -> LinkOptions:
 
 
 def ssh_link_arguments(link: LinkOptions, forwards: Forwards, mark: str) -> list[str]:
-    """The arguments of ssh(1). mark: is printed first, see Way.
+    """Return the arguments of ssh(1). mark: printed first, see Way.
 
-    The numbers of ports are the same at both ends, so what dora tells of its addresses is true on
+    The numbers of ports are the same at both ends, so the addresses that dora announces are true on
     each machine. Raises DoraSystemdError (BAD_INPUT) for ports that are not safe to forward, and
-    for a host that is none.
+    for an invalid host.
     """
     check_forwards(forwards, link.machine)
     host = parse_host(link.host)
@@ -104,10 +105,10 @@ def ssh_link_arguments(link: LinkOptions, forwards: Forwards, mark: str) -> list
 
 
 def member_words(link: LinkOptions) -> list[str]:
-    """The arguments of doractl on the member, with the name that the head has for it.
+    """Return the arguments of doractl on the member, with the member's name on the head.
 
-    A link with a key of its own says so: ssh also tries what else ssh_config(5) names, and such a
-    key of the account can do everything.
+    A link with its own key adds RESTRICTED: ssh also tries the keys that ssh_config(5) names, and
+    with such a key the account could run any command.
     """
     verb, *rest = link.words
     restricted = [RESTRICTED] if link.identity else []

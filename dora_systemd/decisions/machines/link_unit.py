@@ -104,8 +104,8 @@ def link_unit(
 
     python: absolute path of the interpreter of dora-systemd. socket: of the head's runner.
     identity: the file with the key of the machine, or "" for the keys of the account.
-    StopWhenUnneeded= ends it with the head's unit, but not while that waits for its restart. A
-    stop of the machine ends the head first, which tells the members.
+    StopWhenUnneeded= stops the link with the head's unit, but not while that waits for its restart.
+    A shutdown of the machine stops the head first, which notifies the members.
     """
     link = LinkOptions(socket, member.machine, member.host.text, member.words, identity)
     argv = link_command(python, link)

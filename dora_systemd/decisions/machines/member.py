@@ -1,8 +1,8 @@
-"""What `doractl start` tells the members of a dataflow, and what is left to the head. Pure.
+"""Divides the settings of a start between the members of a dataflow and the head. Pure.
 
-What is said of nodes goes to the machine that runs them. What is said of the dataflow as a whole
-goes to all, as far as nodes see it: variables, the sandbox, the grace duration. Limits and other
-properties of the unit are those of the head; an entry of `machines:` has those of its machine.
+Settings of a node go to the machine that runs the node. Settings of the whole dataflow go to all
+machines, as far as nodes depend on them: variables, the sandbox, the grace duration. Limits and
+other properties of the unit apply to the head; an entry of `machines:` has those of its machine.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -85,7 +85,7 @@ def member_of(
     settings: Settings,
     variables: Mapping[str, str],
 ) -> Member:
-    """What the machine is told. Raises DoraSystemdError (BAD_INPUT) if that is too long.
+    """Return the Member for a machine. Raises DoraSystemdError (BAD_INPUT) for too long settings.
 
     options: before on_head(), with the name of the head. variables: of --env and of the
     environment files here.

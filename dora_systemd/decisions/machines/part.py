@@ -25,7 +25,7 @@ def is_here(options: RunnerOptions, node: str) -> bool:
 
 
 def own_options(options: RunnerOptions) -> RunnerOptions:
-    """The options with what they say of this machine's nodes only."""
+    """Return the options without those for nodes of other machines."""
     return options._replace(
         node_limits=tuple(one for one in options.node_limits if is_here(options, one.node)),
         node_rights=tuple(one for one in options.node_rights if is_here(options, one.node)),
@@ -72,7 +72,7 @@ def check_placed(options: RunnerOptions, dataflow: Dataflow) -> None:
 
 
 def launch_files(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, str]:
-    """What launch/NODE says, by node. Raises DoraSystemdError for a node that cannot run."""
+    """Format launch/NODE for each node. Raises DoraSystemdError for a node that cannot run."""
     return {
         node.id: _launch_file(launcher_words(node, dataflow.source, plan))
         for node in dataflow.nodes

@@ -14,7 +14,7 @@ from dora_systemd.names import settings_path
 from dora_systemd.terminal_text import short_line
 
 PLACE = "--place"
-"""The option of `doractl member` that asks whether a directory may be written."""
+"""The option of `doractl member` that checks whether a directory may be written."""
 INSTALL = "apt install rsync"
 _LONGEST = 300
 _SSH = (
@@ -33,9 +33,10 @@ def target_of(member: Member) -> str:
 
 
 def rsync_command(member: Member, dataflow: str) -> list[str]:
-    """Copies the directory of the dataflow file to the machine. dataflow: its absolute path here.
+    """Return the command that copies the directory of the dataflow file to the machine.
 
-    A settings file is of its machine: that of the head says what the head has.
+    dataflow: absolute path of the file on this machine. The settings file is not copied, because
+    its settings are those of the head.
     """
     host = member.host
     ssh = shlex.join([*_SSH, *([f"-p{host.port}"] if host.port else [])])
@@ -52,7 +53,7 @@ def _bracketed(host: Host) -> str:
 
 
 def place_words(member: Member) -> tuple[str, ...]:
-    """The arguments of doractl that ask the machine about its directory."""
+    """Return the arguments of doractl that check the member's directory on its machine."""
     return ("member", f"{PLACE}={target_of(member)}")
 
 
@@ -62,7 +63,7 @@ def format_place(problem: str, hint: str) -> str:
 
 
 def check_place(member: Member, answer: str) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) if the machine says that nothing may be copied there."""
+    """Raise DoraSystemdError (BAD_INPUT) if the machine refuses a copy into the directory."""
     try:
         found = json.loads(answer.strip().splitlines()[-1])
         problem, hint = (short_line(str(found[key]), _LONGEST) for key in ("problem", "hint"))
@@ -74,7 +75,7 @@ def check_place(member: Member, answer: str) -> None:
 
 
 def check_copied(member: Member, status: int, said: str) -> None:
-    """Raise DoraSystemdError if rsync has failed. said: on standard error."""
+    """Raise DoraSystemdError if rsync has failed. `said`: its standard error."""
     if status == SSH_FAILED:
         raise unreached(member.host, said)
     if status:
@@ -82,12 +83,12 @@ def check_copied(member: Member, status: int, said: str) -> None:
 
 
 def _first_words(said: str) -> str:
-    """rsync says last only that there were errors."""
+    """The first line of rsync's errors: its last line reports only that there were some."""
     lines: Sequence[str] = [one for one in said.splitlines() if one.strip()]
     return last_line(lines[0]) if lines else ""
 
 
 def refusal(member: Member, reason: str, hint: str) -> DoraSystemdError:
-    """Nothing is started then."""
+    """Return the error for a copy that failed, after which nothing is started."""
     message = f"cannot copy the dataflow to machine {member.machine}: {reason}"
     return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

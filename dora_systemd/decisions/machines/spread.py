@@ -194,7 +194,7 @@ def spread(
     hostname: str,
     route: Route,
 ) -> tuple[RunnerOptions, tuple[Member, ...]]:
-    """The options of the head's runner, and what the members are told.
+    """Divide a start between machines: the options of the head's runner, and the members.
 
     variables: of --env and environment files. hostname, route: of the head. Raises
     DoraSystemdError (BAD_INPUT) for a placement that does not work, and for what works on one
@@ -217,9 +217,9 @@ def spread(
 
 
 def part(options: RunnerOptions, settings: Settings) -> RunnerOptions:
-    """The options of a member's runner. settings: those of its machine, with what the head tells.
+    """Return the options of a member's runner. settings: of its machine, with those of the head.
 
-    The head looks after owed outputs. Raises DoraSystemdError (BAD_INPUT) as spread().
+    Only the head watches owed outputs. Raises DoraSystemdError (BAD_INPUT) as spread().
     """
     own = options._replace(owes=())
     _check(own, settings)
@@ -246,7 +246,7 @@ def _refused(options: RunnerOptions, settings: Settings) -> Iterator[tuple[str, 
         if one.node in away:
             reason = f"node {one.node} is on machine {away[one.node]}, and owes an output"
             yield reason, "leave owes of this node out"
-    # The head asks dora for the nodes, and would take one that waits elsewhere for late.
+    # The head starts all nodes by dora, and would take a node that waits on a member for late.
     for need in options.needs:
         if need.node in away:
             reason = f"node {need.node} is on machine {away[need.node]}, and waits for {need.path}"

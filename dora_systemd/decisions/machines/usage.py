@@ -1,7 +1,7 @@
-"""What members say of their nodes and their usage, in the tables that the head gets. Pure.
+"""The reports of members about their nodes and the nodes' usage, as the head reads them. Pure.
 
-The head cannot read the cgroups of another machine, and a member can lie about its own nodes. Its
-numbers only have to be ones that can be.
+The head cannot read the cgroups of another machine, and a member can lie about its own nodes: the
+numbers of a member are only checked to be possible.
 """
 
 from collections.abc import Mapping
@@ -80,10 +80,10 @@ def _is_away(status: CellStatus, node: str) -> bool:
 
 
 def merged(table: CellStatus, others: Mapping[str, CellStatus]) -> CellStatus:
-    """The table of the head. others: by machine; each is believed for its own nodes only.
+    """Merge the tables of members into that of the head. others: by machine, for its nodes only.
 
-    The head itself hears from dora what nodes do. A member knows more of why, counts the lines,
-    reads what its nodes use, and hears what they say of themselves.
+    The head receives the events of all nodes from dora. A member adds the reasons of ends, the
+    counts of lines, the usage of its nodes, and the STATUS= that the nodes send.
     """
     nodes = {ident: _told(ident, node, others) for ident, node in table.nodes.items()}
     away = {ident: others[n.machine] for ident, n in table.nodes.items() if n.machine in others}

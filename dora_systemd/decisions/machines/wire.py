@@ -1,11 +1,11 @@
-"""What head and member say to each other: lines of JSON through one ssh. Pure.
+"""The messages between head and member: lines of JSON through one ssh. Pure.
 
     head's runner == link ==ssh== doractl member == member's runner
 
-The link gives the runner of the head a Link, and gets Forwards. Then it only carries lines. The
-first line to a member is a Part; after that each side says Beat every second. A side that hears
-nothing for LEASE ends its part of the dataflow. To the head a member is hostile, and the other way
-round: lines and texts are bounded, and every value has a type.
+The link sends a Link to the runner of the head, and receives Forwards. Then the link only passes
+lines. The first line to a member is a Part; after that each side sends a Beat every second. A side
+that receives nothing for LEASE ends its part of the dataflow. Head and member do not trust each
+other: lines and texts are bounded, and every value has a type.
 """
 
 import json
@@ -135,32 +135,32 @@ class Ended:
     """Member to head: its part has ended or is about to."""
 
     reason: str = ""  # one line, "" if all went well
-    by: str = ""  # who asked for it, or ""
+    by: str = ""  # who requested the end, or ""
     # 1 if its part has failed by itself; 0 also if its machine shuts down, or it has lost the head
     failed: int = 0
 
 
 @dataclass(frozen=True)
 class StopPart:
-    """Head to member: end your nodes within `grace` µs, without asking dora."""
+    """Head to member: end your nodes within `grace` µs, without a request to dora."""
 
     grace: int
 
 
 @dataclass(frozen=True)
 class Stopping:
-    """Head to member: the head is about to have dora stop all nodes. by: who asked for it."""
+    """Head to member: the head is about to have dora stop all nodes. by: who requested that."""
 
     by: str = ""
 
 
 RUNNER_ENDED = "its supervisor process has ended"
-"""words of a Lost: what the relay of a member says when its runner has ended without a word."""
+"""The reason in a Lost from the relay of a member whose runner has ended without reporting why."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Head to member: somebody has asked for a restart or stop of one of its nodes. by: who."""
+    """Head to member: a restart or stop of one of the member's nodes was requested. by: who."""
 
     node: str
     what: str

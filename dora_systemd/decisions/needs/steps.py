@@ -19,11 +19,11 @@ class Do(Enum):
     LET_GO = "go on"
     """Open its gate."""
     GIVE_UP = "give it up"
-    """It has no restarts, and what it needs is there: its end was its own."""
+    """The node has no restarts left, and what it needs exists: the node itself has failed."""
 
 
 class NeedStep(NamedTuple):
-    """One step. needs: what the node waits for, for people."""
+    """One step. needs: what the node waits for (human-readable)."""
 
     do: Do
     node: str

@@ -20,8 +20,8 @@ _LOOKS = 8
 """Looks within the shortest time that any node has."""
 _SHORTEST_TICK, _LONGEST_TICK = SECOND // 40, SECOND
 _EARLY = SECOND // 5
-"""µs. dora tells that a process is ready a moment after its first message can come. It is less than
-the delay before a restart, in which nobody sends any."""
+"""µs by which a first message may precede dora's report that the process is ready: less than the
+delay before a restart, in which no process of the node sends messages."""
 BEATS = 2
 """Ticks after which a probe that has not noted its beat counts as stopped."""
 
@@ -30,7 +30,7 @@ BEATS = 2
 class Look:
     """What is known at one moment."""
 
-    # at_us, beat_us, heard: CLOCK_MONOTONIC, 0 is never
+    # at_us, beat_us, `heard`: CLOCK_MONOTONIC, 0 is never
     at_us: int
     beat_us: int  # the last beat of the probe
     heard: Sequence[int]  # the last message of each slot of Feeds
@@ -70,7 +70,7 @@ class Judge:
     owes: tuple[Owed, ...]
     ears: tuple[Ear, ...] = ()
     at_us: int = 0  # the last look, 0 before the first
-    probe: int = 0  # the one that was heard at the last look
+    probe: int = 0  # the number of the probe at the last look
     feeds: Feeds = NO_FEEDS  # what the nodes get
 
     @property
@@ -80,7 +80,7 @@ class Judge:
         return min(max(shortest // _LOOKS, _SHORTEST_TICK), _LONGEST_TICK)
 
     def silent_of(self, node: str) -> str:
-        """What is missing of a node now, for people, or ""."""
+        """Return the outputs that a node owes now (human-readable), or ""."""
         pairs = zip(self.owes, self.ears, strict=True)
         return ", ".join(
             silence(own, ear) for own, ear in pairs if own.node == node and ear.is_silent
@@ -88,7 +88,7 @@ class Judge:
 
 
 def silence(owed: Owed, ear: Ear) -> str:
-    """What is missing, for people. It says the time that was allowed, so it stays the same."""
+    """Format what is missing (human-readable), with the allowed time: so the text is stable."""
     why = f"{STARVED}{ear.starved}" if ear.starved else ""
     if ear.has_come:
         return f"no {owed.output} for {format_duration(owed.within)}{why}"
@@ -96,12 +96,12 @@ def silence(owed: Owed, ear: Ear) -> str:
 
 
 def look(judge: Judge, now: Look) -> tuple[Judge, tuple[Verdict, ...]]:
-    """The judge after a look, and what has changed."""
+    """Judge the outputs at one moment; return the next Judge, and what has changed."""
     step = min(max(now.at_us - judge.at_us, 0), judge.tick) if judge.at_us else 0
     if now.at_us - now.beat_us > BEATS * judge.tick:
         step = 0
     before = judge.ears or (Ear(),) * len(judge.owes)
-    if now.probe != judge.probe:  # nobody heard what came between two probes
+    if now.probe != judge.probe:  # messages between two probes were not received
         step, before = 0, tuple(map(_unheard, before))
     ears: list[Ear] = []
     verdicts: list[Verdict] = []

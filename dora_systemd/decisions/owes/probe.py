@@ -1,10 +1,10 @@
-"""The probe: the node that receives what nodes owe, and what it tells of their inputs. Pure.
+"""The probe: a node that receives the owed outputs, and what it records of inputs. Pure.
 
 dora has no counter for an output, and inspection of topics copies every message to the coordinator.
-A node beside the others with `queue_size: 1` leaves the path of the messages as it is: dora passes
-it references to shared memory, which it does not look at. There is one probe for each dataflow, not
-for each node. The runner adds it when all nodes are ready, so it delays no start.
-benchmarks/README.md has what it costs.
+An additional node with `queue_size: 1` leaves the path of the messages as it is: dora passes
+references to shared memory, which the probe does not open. There is one probe for each dataflow,
+not for each node. The runner adds the probe when all nodes are ready, which delays no start.
+benchmarks/README.md has what the probe costs.
 
 The probe and the runner share a file of times: 8 bytes for the beat of the probe, then 8 for each
 owed output, in their order, and for each other input of the nodes that owe them; CLOCK_MONOTONIC in
@@ -39,8 +39,8 @@ def probe_definition(
 ) -> dict[str, Any]:
     """The probe as a node of dora's descriptor.
 
-    number: how many there were before, in this run. command: the program. launcher: what executes
-    it. inputs: the outputs to hear, NODE/OUTPUT, each with its slot in the file of times.
+    number: of earlier probes in this run. command: the program. launcher: what executes the
+    program. inputs: the outputs to receive, NODE/OUTPUT, each with its slot in the file of times.
     """
     interpreter, script = launcher
     return {
@@ -81,13 +81,13 @@ _REGULAR = 4
 
 @dataclass(frozen=True)
 class Feeds:
-    """The inputs of owing nodes that the probe hears."""
+    """The inputs of owing nodes that the probe receives, too."""
 
     # NODE/OUTPUT of each slot in the file of times: the owed outputs, then the others
     places: tuple[str, ...] = ()
     # the slots of the inputs of each owing node
     by_node: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    # the nodes of which every input is heard: none is a timer, or comes from another machine
+    # the nodes of which the probe receives every input: no timer, and none from another machine
     whole: frozenset[str] = frozenset()
 
 

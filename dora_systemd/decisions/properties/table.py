@@ -9,7 +9,7 @@ keys, each with a good value and four bad ones:
 - It has no dry run. `systemd-analyze verify` exits with 0 and prints values of Environment=.
 - It refuses good values that D-Bus and unit files take, such as PrivateUsers=identity of our
   sandbox, PrivateTmp=disconnected, two addresses in IPAddressAllow=, and StartupMemoryMax=.
-- A quarter of its refusals do not name the key, and none says which values are valid.
+- A quarter of its refusals do not name the key, and none lists the valid values.
 - It passes on a line break in Description=: the unit file has one more line, with any key.
 - All users see its command line. In a user's manager, nobody else sees Environment= otherwise.
   One argument has at most 128 KiB.

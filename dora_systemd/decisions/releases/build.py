@@ -49,7 +49,7 @@ share, for the path of the release is not in them. Packages have files that no P
 
 @dataclass(frozen=True)
 class BuildTask:
-    """What the program of the build's unit is told."""
+    """The task of the program in a build's unit."""
 
     # name, uuid: of the dataflow; of a build of a project its file, and ""
     name: str
@@ -113,7 +113,7 @@ def is_moving(dataflow: Dataflow) -> bool:
 
 
 def lock_places(dataflow: str) -> tuple[str, ...]:
-    """Where a uv.lock may be: beside the dataflow file, or at the top of the project."""
+    """Return where a uv.lock may be: next to the dataflow file, or at the top of the project."""
     return tuple(str(PurePath(one, LOCK)) for one in (PurePath(dataflow).parent, "."))
 
 

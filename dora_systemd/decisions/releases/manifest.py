@@ -1,4 +1,4 @@
-"""release.json: describes a release for people and for a rollback, and its files. Pure.
+"""release.json: describes a release and its files, for `releases` and for a rollback. Pure.
 
 Also makes the id of a release, which names.py reads.
 """

@@ -37,9 +37,9 @@ class Parcel:
     """A project on its way to another host."""
 
     name: str
-    source: str  # its directory, there for people only
-    dataflow: str  # the path of its file, relative to it
-    directory: str | None  # the working directory, relative to it; None for that of the file
+    source: str  # the project's directory on the sender, only shown
+    dataflow: str  # the path of the dataflow file, relative to `source`
+    directory: str | None  # the working directory, relative to `source`; None for the file's
     revision: str  # of git, or ""
     files: Mapping[str, Stored] = field(default_factory=dict)
     owner: str = ""  # the user whose files they are, "" for those of root and of who sends them
@@ -112,7 +112,7 @@ def format_wants(numbers: Iterable[int]) -> str:
 
 
 def parse_wants(value: Any, parcel: Parcel) -> list[Stored] | None:
-    """The contents that an answer asks for; None for what is no such answer."""
+    """Parse an answer to the contents that the host requests; None for an invalid answer."""
     wants, contents = value.get("wants") if isinstance(value, dict) else None, parcel.contents
     if not isinstance(wants, list) or len(wants) > len(contents):
         return None

@@ -27,7 +27,7 @@ class Switch(NamedTuple):
     former: str  # the release that ended, "" if none ran
     release: str  # the one that runs since, or ""
     how: str  # why `former` ended, one of ENDS
-    by: str = ""  # who asked; "" if that is not known
+    by: str = ""  # who requested the change; "" if that is not known
     reason: str = ""
     node: str = ""  # the one that failed, or ""
     invocation: str = ""  # of systemd, the life in which `node` failed
@@ -97,9 +97,9 @@ def runs(history: Sequence[Switch], known: Iterable[str] = ()) -> list[str]:
 
 
 def marks(history: Sequence[Switch]) -> dict[str, Switch]:
-    """The releases that failed a trial or were rolled back from, and how.
+    """Return the releases that failed a trial or were rolled back from, and how.
 
-    A mark ends when the release passes a trial after that, which somebody has asked for by name.
+    A mark ends when the release passes a later trial, which only a request with its name starts.
     """
     found: dict[str, Switch] = {}
     for one in history:
@@ -142,7 +142,7 @@ def kept(history: Sequence[Switch], known: Collection[str]) -> list[Switch]:
 
 
 def _last_run(history: Sequence[Switch]) -> str:
-    """The release that runs as far as the history tells, or ""."""
+    """The release that runs according to the history, or ""."""
     found = (one.release for one in reversed(history) if one.how != REMOVED)
     return next(found, "")
 

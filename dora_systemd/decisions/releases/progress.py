@@ -1,4 +1,4 @@
-"""What deploy and rollback tell while they last, and which of it is worth a line. Pure."""
+"""The steps that deploy and rollback report, and the choice of those worth a line. Pure."""
 
 import re
 from math import inf
@@ -12,17 +12,17 @@ STAGES = (WAIT, COPY, CHECK, BUILD, STOP, START, SOAK, VERDICT, BACK)
 
 _COUNT = re.compile(r"(\d{1,6})/(\d{1,6}) nodes (ready|running)")
 _IN_SECONDS = 600 * SECOND
-"""A soak up to this long is told as "12/30 s"."""
+"""A soak up to this long is shown as "12/30 s"."""
 
 Amount = tuple[int, int]
-"""How much of it is done, and all of it."""
+"""The part of a total that is done, and the total."""
 
 
 class Step(NamedTuple):
     """A moment of a change of the release."""
 
     stage: str  # one of STAGES
-    text: str  # for people
+    text: str  # human-readable
     amount: Amount | None = None  # bytes in COPY, µs in SOAK
     nodes: Amount | None = None  # those that are ready, of all
     passed: bool | None = None  # the verdict
@@ -83,18 +83,18 @@ def checking() -> Step:
 
 
 def building(line: str) -> Step:
-    """The build goes on. line: the last one that it has written, "" before the first."""
+    """Return the step of a running build. line: the last of its output, "" before the first."""
     return Step(BUILD, f"building: {line}" if line else "building")
 
 
 def stopping(status: str) -> Step:
-    """What runs is stopped. status: STATUS= of its unit."""
+    """Return the step that stops the former release. status: STATUS= of its unit."""
     _, comma, left = status.partition("stopping, ")
     return Step(STOP, f"stopping what runs now: {left}" if comma else "stopping what runs now")
 
 
 def starting(status: str) -> Step:
-    """The release starts. status: STATUS= of its unit."""
+    """Return the step that starts the new release. status: STATUS= of its unit."""
     return Step(START, f"trial: {status or 'starting'}", nodes=_count(status))
 
 

@@ -1,9 +1,9 @@
 """Finds the files of a project that a Python program consists of, by its import statements.
 
 Hot reload restarts a node when one of these files changes. program_files() parses the script,
-follows each import statement to files that exist, and goes on with their imports. It runs no code
-of the project, and reads files only through the given `read`, which decides what belongs to the
-project. The rules of the search are those of Python's import system:
+follows each import statement to files that exist, and then the imports of those files. No code of
+the project runs. program_files() reads files only through the given `read`, which decides what
+belongs to the project. The rules of the search are those of Python's import system:
 https://docs.python.org/3/reference/import.html
 
 The result can have too many files, which costs a restart: `from a import b` counts a file a/b.py

@@ -27,7 +27,7 @@ NOT_OF_PROJECT = (
     # Version control, environments and caches.
     *(".git/", ".hg/", ".svn/", "__pycache__/", "venv/", ".venv/", ".dora/", "node_modules/"),
     *("site-packages/", ".tox/", ".nox/", ".*_cache/", ".hypothesis/", "*.egg-info/"),
-    # Logs, temporary files, and files that editors create beside the edited file.
+    # Logs, temporary files, and files that editors create next to the edited file.
     *("*.log", "*.jsonl", "log/", "logs/", "tmp/", "*.tmp", "*.temp", "*.part", "*.bak", "*~"),
     *(".#*", "#*#", "*.sw?", "4913", "*.pyc"),
 )

@@ -154,7 +154,7 @@ def _one_line(script: str) -> str:
 
 
 def ssh_arguments(host: Host, way: Way, command: str) -> list[str]:
-    """The arguments of ssh(1). On a terminal it may ask for a password or about a host key."""
+    """Return the arguments of ssh(1), which on a terminal may prompt for a password or a key."""
     is_terminal = way is Way.TERMINAL
     options = {**_OPTIONS, **({} if is_terminal else {"BatchMode": "yes"})}
     words = [word for key, value in options.items() for word in ("-o", f"{key}={value}")]

@@ -86,7 +86,7 @@ class Merge:
         return all(self._counts[host] for host in self._open)
 
     def _is_flooded(self) -> bool:
-        """Whether a host cannot go on before something of it is printed."""
+        """Whether the buffer of a host is full, so that one of its records must be printed."""
         return self.is_full(self._heap[0].host)
 
 

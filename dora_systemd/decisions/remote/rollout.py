@@ -1,4 +1,4 @@
-"""A release for one host after the other: what became of each, and whether to go on. Pure."""
+"""A release for one host after the other: the verdict on each, and whether to continue. Pure."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -19,7 +19,7 @@ _UNKNOWN = "-"
 
 
 class Verdict(NamedTuple):
-    """What became of a host. word: for people. release, former: ids, or ""."""
+    """The result of one host. word: human-readable. release, former: ids, or ""."""
 
     host: str
     word: str

@@ -1,4 +1,4 @@
-"""Why a host did not do what was asked: ssh's own words, and what to do. Pure."""
+"""Errors of requests to hosts by ssh: the reason in ssh's messages, and a hint. Pure."""
 
 import re
 
@@ -26,7 +26,7 @@ _INSTALL = "install dora-systemd there, or link it into /usr/local/bin: ssh has 
 
 
 def unreached(host: Host, words: str) -> DoraSystemdError:
-    """The error of a host to which ssh did not come. words: what ssh and the host have said."""
+    """Return the error of a host that ssh cannot reach. words: messages of ssh and the host."""
     hint = next((hint for part, hint in _HINTS if part in words), "try: ssh {text} true")
     name = host.destination.rpartition("@")[2]
     hint = hint.format(text=_by_ssh(host), name=name)
@@ -63,7 +63,7 @@ def without_doractl(host: Host) -> DoraSystemdError:
 
 
 def not_run(host: Host, words: str) -> DoraSystemdError:
-    """The error of a host whose login shell did not run what it was told."""
+    """Return the error of a host whose login shell did not run the command."""
     reason = last_line(words) or "its login shell ends at once"
     hint = "the account needs a shell that runs commands, see chsh(1) and sshd_config(5)"
     return _error(f"cannot run doractl on {host.text}: {reason}", hint)
@@ -81,7 +81,7 @@ def too_much(host: Host) -> DoraSystemdError:
 
 
 def is_of_ssh(data: bytes) -> bool:
-    """Whether ssh has said this, of a connection that is lost: then the error repeats it."""
+    """Return whether ssh wrote this about a lost connection, which the error repeats."""
     return _OF_SSH.fullmatch(data) is not None
 
 
@@ -90,9 +90,9 @@ def _error(message: str, hint: str) -> DoraSystemdError:
 
 
 def last_line(words: str) -> str:
-    """The last line of what ssh or a login shell has said, without the name of ssh.
+    """Return the last line of the messages of ssh or a login shell, without the name of ssh.
 
-    Objects for programs are no words: those of doractl, which is asked for them.
+    Lines with JSON objects do not count: they are the output that was requested from doractl.
     """
     lines = [line.strip() for line in without_sequences(words).splitlines()]
     lines = [line for line in lines if line and not line.startswith("{")]
@@ -100,7 +100,7 @@ def last_line(words: str) -> str:
 
 
 def words_of_doractl(complaint: str) -> tuple[str, str]:
-    """The last error of a doractl over there, and its hint, from its standard error."""
+    """Parse the last error of doractl on a host, and its hint, from its standard error."""
     said = [one.removeprefix("doractl: ") for one in complaint.splitlines()]
     hints = [one.removeprefix(_HINT) for one in said if one.startswith(_HINT)]
     words = last_line("\n".join(one for one in said if not one.startswith(_HINT)))
@@ -118,7 +118,7 @@ def ending_error(
 ) -> DoraSystemdError | None:
     """Why a conversation ended, None if doractl itself ended there.
 
-    status: exit status of ssh. is_in: whether the mark came. said, complaint: the last of standard
+    status: exit status of ssh. is_in: whether the mark came. `said`, complaint: the end of standard
     output and error; before the mark, those of ssh and of the login shell.
     """
     if is_in:

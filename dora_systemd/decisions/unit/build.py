@@ -1,9 +1,8 @@
 """The transient units of builds.
 
-That of a release is the unit of the dataflow, as far as a build needs it.
-Same user, same sandbox, same network. What is different: it may write the tree that it builds, and
-sees no other release; it has no credentials, no rights of single nodes, and few CPU shares beside
-what runs.
+The unit of a release's build has the user, the sandbox and the network of the dataflow's unit. What
+is different: a build may write the tree that it builds, and sees no other release; it has no
+credentials, no rights of single nodes, and few CPU shares compared with running dataflows.
 """
 
 from collections.abc import Mapping

@@ -142,7 +142,9 @@ def _command(argv: Sequence[str], *flags: str) -> Sequence[Command]:
 
 
 def stop_properties(options: RunnerOptions) -> dict[str, Property]:
-    """SIGTERM for the runner only, which tells dora; then SIGKILL for all, see systemd.kill(5).
+    """Properties of the stop: SIGTERM for the runner, which stops dora; later SIGKILL for all.
+
+    See systemd.kill(5).
 
     dora kills a node at 1.5 times its grace duration.
     """
@@ -165,7 +167,7 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     )
     common = typed(
         RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()),
-        # The signal of the watchdog: a runner that hangs says nothing about its nodes.
+        # The signal of the watchdog: that the runner hangs does not mean that its nodes failed.
         RestartForceExitStatus=((), (int(signal.SIGABRT),)),
     )
     if policy.policy == "no":

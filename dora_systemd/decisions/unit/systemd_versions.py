@@ -45,7 +45,7 @@ _PLAIN_FLAGS = frozenset({"ignore-failure", "no-env-expand"})
 _SILENT = {
     # The runner creates the group and moves into it if systemd does not.
     "DelegateSubgroup": "supervisor",
-    # The sandbox uses it if possible, as dora-systemd-security(7) says.
+    # The sandbox uses this value if possible, see dora-systemd-security(7).
     "PrivateUsers": "identity",
 }
 """Values of ours that are left out without a warning."""

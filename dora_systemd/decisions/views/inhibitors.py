@@ -1,4 +1,4 @@
-"""Who inhibits restarts of a dataflow, for people and for programs. Pure.
+"""Who inhibits restarts of a dataflow, as text and as JSON. Pure.
 
 The kernel knows who holds a lock. The lock file only has the reasons, a line "PID TEXT" for each.
 """

@@ -1,4 +1,4 @@
-"""What a verb has done with one thing: a line for people, an object for programs."""
+"""The outcome of a verb for one subject: a line of text, or a JSON object."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

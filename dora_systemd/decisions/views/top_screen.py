@@ -32,7 +32,7 @@ _BACK = "Any key goes back."
 _SORT_KEYS = {sort[0]: sort for sort in SORTS}
 _ACTIONS = {"R": "restart", "S": "stop"}
 _FRAME = 3
-"""Lines around the rows: title, header, and what is said or asked in the last line."""
+"""Lines around the rows: title, header, and the last line with a message or a question."""
 
 
 class Line(NamedTuple):
@@ -54,9 +54,10 @@ class Change(NamedTuple):
 
 
 class TopScreen:
-    """The screen of a person who looks, selects and sorts.
+    """The screen of `top`, and its reactions to keys.
 
-    by: one of SORTS. is_over: the person has quit. said: the last line, unless it asks something.
+    by: one of SORTS. is_over: the person has quit. `said`: the message in the last line, unless
+    that line has a question.
     """
 
     def __init__(self, by: str) -> None:

@@ -17,7 +17,7 @@ _ANY_TIME = "now"
 
 
 def judge_core_pattern(pattern: str) -> Finding:
-    """Say whether `coredumpctl` shows a crash of a node. pattern: see kernel.core_pattern."""
+    """Judge whether `coredumpctl` shows a crash of a node. pattern: see kernel.core_pattern."""
     pattern = pattern.strip()
     if _COREDUMP.match(pattern):
         return Finding("core dumps", State.OK, "coredumpctl shows crashes of nodes")

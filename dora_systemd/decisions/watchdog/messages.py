@@ -1,4 +1,4 @@
-"""What a node says to its notify socket, see sd_notify(3), and what the status table keeps of it.
+"""Messages of a node to its notify socket, see sd_notify(3), and what the status table keeps.
 
 A node only reports about itself, so READY=1, MAINPID=, FDSTORE=1 and the like have no effect: dora
 knows when a node is ready, and which process it is.
@@ -44,7 +44,7 @@ def _clean(value: bytes) -> str:
 
 
 class Sign(NamedTuple):
-    """What one node has said of itself."""
+    """The last messages of one node about itself."""
 
     status: str = ""  # the text of STATUS=, or ""
     at_us: int = 0  # CLOCK_MONOTONIC µs of its last WATCHDOG=1, 0: none
@@ -52,7 +52,7 @@ class Sign(NamedTuple):
 
 
 def parse_sign(raw: Any) -> Sign:
-    """A sign in a table that the nodes' user can write; what is none becomes an empty one."""
+    """Parse a Sign in a table that the nodes' user can write; an invalid one becomes empty."""
     match raw:
         case [str() as status, int() as at_us, int() as watchdog] if _are_times(at_us, watchdog):
             return Sign(status[:MAX_STATUS], at_us, watchdog)

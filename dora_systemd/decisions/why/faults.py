@@ -16,7 +16,7 @@ ENDS = ("dataflow-finished", "dataflow-stopped")
 FAULT_IDS = tuple(EVENTS[name].message_id for name in (*FAULTS, *ENDS))
 """The MESSAGE_IDs that a trial looks for."""
 _HOW = {"node-watchdog": "hung, ", WAITING: "waits for "}
-"""What `why` and `list` say before the reason, where that is not the name of the event."""
+"""The text that `why` and `list` show before the reason, instead of the name of the event."""
 
 
 class Fault(NamedTuple):
@@ -25,13 +25,13 @@ class Fault(NamedTuple):
     reason: str
     node: str = ""  # the first that failed, or ""
     is_stop: bool = False  # somebody has stopped the dataflow, so nothing is started in its place
-    is_outside: bool = False  # the trial could not go on, whatever the release is like
+    is_outside: bool = False  # the trial could not continue for a reason outside the release
     invocation: str = ""  # of systemd, the life in which it was
     lines: tuple[str, ...] = ()  # the last ones of the node, or of all nodes, oldest first
 
     @property
     def is_verdict(self) -> bool:
-        """Whether it tells that the release is bad."""
+        """Whether the fault proves that the release is bad."""
         return not (self.is_stop or self.is_outside)
 
 

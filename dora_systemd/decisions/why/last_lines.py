@@ -1,7 +1,7 @@
 """Chooses the last lines to show of nodes that failed. Pure.
 
-What nodes wrote comes before what dora says in their name, or about them; dora's errors count as
-words of the node. A line that a node repeats is one line.
+Lines that nodes wrote precede lines that dora wrote in their name or about them; dora's errors
+count as lines of the node. A line that a node repeats is one line.
 """
 
 from collections.abc import Iterable, Mapping

@@ -1,6 +1,6 @@
 """Finds what happened to a dataflow, and why: the verdict of `doractl why`. Pure.
 
-If the cause is not recorded, the verdict says so; it never guesses.
+If the cause is not recorded, the verdict states that: a verdict never guesses.
 """
 
 from collections.abc import Mapping, Sequence
@@ -86,7 +86,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
 
 
 def _is_spent(life: Life) -> bool:
-    """Whether the runner has refused this restart: the life before it tells what has failed."""
+    """Whether the runner has refused this restart: the life before has recorded the failure."""
     end = life.last("dataflow-failed")
     return end is not None and end.detail("cause") == Cause.RESTARTS_SPENT
 

@@ -131,11 +131,11 @@ _FULL = re.compile(
     r"(?:No space left on device|Disk quota exceeded|ENOSPC|EDQUOT)"
     r"(?:[^\n'\"]{0,40}['\"](?P<path>/[^\n'\"]{1,200})['\"])?"
 )
-"""What fails with it often says nothing of the path; Python puts it behind."""
+"""Many programs report these errors without the path; Python appends the path."""
 
 
 def known_remedy(lines: Iterable[str], node: str = "the node") -> str:
-    """The remedy for a node with these last lines, or "" if they do not tell."""
+    """Find the remedy for a node with these last lines, or "" if they match no known error."""
     text = "\n".join(lines)
     if full := _FULL.search(text):
         return _space(full["path"], node)

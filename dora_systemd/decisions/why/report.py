@@ -317,7 +317,7 @@ _NUMBERS = {
 def report_object(report: Report, row: DataflowRow) -> dict[str, Any]:
     """The report for JSON. row: the dataflow as `list` knows it.
 
-    The status is that of the verdict: the journal has more to say about an end than systemd.
+    The status is that of the verdict: the journal has more records of an end than systemd.
     """
     verdict, file = report.verdict, row.dataflow or report.subject.file
     return {
