@@ -33,8 +33,10 @@ LOOKS = re.compile(r"doractl (list|why|logs)\b|systemctl (is-|list-|status)|jour
 """Commands that change nothing. They are typed again until they show what is expected."""
 LOOK_SECONDS = 20.0
 QUOTED = re.compile(r"'[^']*'|\"(?:\\.|[^\"\\])*\"|\\.")
-UNSEEN = re.compile(r"[^\n]*\r\x1b\[K|\x1b[\[(][0-9;:?]*[a-zA-Z]|\x1b[=>]")
-"""A line that a command has written anew, colours, and modes of the terminal."""
+UNSEEN = re.compile(
+    r"[^\n]*\r\x1b\[K|\x1b[\[(][0-9;:?]*[a-zA-Z]|\x1b[=>]|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)"
+)
+"""A line that a command has written anew, colours, modes of the terminal, and what it is told."""
 
 
 class Typed(NamedTuple):
