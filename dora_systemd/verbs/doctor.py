@@ -57,7 +57,7 @@ from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.logins import PASSWD, is_lingering, judge_logins, linger_command
-from dora_systemd.verbs.start.programs import version_warnings
+from dora_systemd.verbs.start.programs import version_trouble
 from dora_systemd.verbs.start.read import config_files
 from dora_systemd.verbs.start.settings import check_config
 from dora_systemd.verbs.start.where import DEFAULT_USER
@@ -252,8 +252,9 @@ def _versions(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
         user = manager.read(cell.unit, ["User"])["User"]
         account = account_from(pwd.getpwnam(user)) if user else None
         with sight_of(account) as sight:
-            for text in version_warnings(cell.options.venv, cell.options.dora, sight):
-                yield Finding("versions", State.WARNING, f"{cell.name}: {text}")
+            text, remedy = version_trouble(cell.options.venv, cell.options.dora, sight)
+            if text:
+                yield Finding("versions", State.WARNING, f"{cell.name}: {text}", remedy)
 
 
 def _coredumps(_scope: Scope, root: Path) -> Iterator[Finding]:

@@ -111,6 +111,18 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
         f"devices are hidden in the sandbox: --device PATH allows one, {_MORE}",
     ),
     (
+        (
+            "annot open display",
+            "ould not connect to display",
+            "couldn't connect to display",
+            "cannot connect to X server",
+            "no display name and no $DISPLAY",
+            "DISPLAY environment variable is missing",
+        ),
+        "nodes have no display: --env DISPLAY=:0 names one, and in system scope --property "
+        f"BindReadOnlyPaths=/tmp/.X11-unix shows its socket, {_MORE}",
+    ),
+    (
         ("No such file or directory: '/tmp/", "No such file or directory: '/var/tmp/"),
         f"/tmp is private in the sandbox: --writable /tmp shares the one of the machine, {_MORE}",
     ),

@@ -6,7 +6,6 @@ in another user's home, or on the machine that the project was copied from.
 
 import os
 import pwd
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePath
 
@@ -131,19 +130,22 @@ def _wheel(prefix: str, wheel: str, sight: Sight) -> str:
     return ""
 
 
-def version_warnings(venv: str | None, dora: str, sight: Sight) -> Iterator[str]:
-    """Warn of Python nodes whose dora has another version than the daemon.
+def version_trouble(venv: str | None, dora: str, sight: Sight) -> tuple[str, str]:
+    """Compare the dora of Python nodes with that of the daemon: what differs, and a remedy, or "".
 
-    venv: of the nodes. Raises DoraSystemdError (BAD_INPUT) for one that no daemon takes.
+    venv: of the nodes. Raises DoraSystemdError (BAD_INPUT) for a dora that no daemon takes.
     """
     version = nodes_dora(venv, sight) if venv else ""
-    if not version:
-        return
-    remedy = f"{venv}/bin/python -m pip install dora-rs"
+    if not version or not venv:
+        return "", ""
+    has_pip = sight.exists(f"{venv}/bin/pip")  # uv's have none
+    install = f"{venv}/bin/pip install" if has_pip else f"uv pip install --python {venv}"
     if version_numbers(version) < OLDEST_DORA:
-        message = f"cannot start nodes with the Python of {shown(venv or '')}: their dora is "
+        message = f"cannot start nodes with the Python of {shown(venv)}: their dora is "
         message += f"{version}, 1.0 or newer is needed"
-        raise DoraSystemdError(message, f"{remedy} --upgrade", ExitCode.BAD_INPUT)
+        raise DoraSystemdError(message, f"{install} --upgrade dora-rs", ExitCode.BAD_INPUT)
     daemon = daemon_dora(dora, sight)
-    if daemon and daemon != version:
-        yield f"the nodes' dora is {version}, the daemon is {daemon}: {remedy}=={daemon}"
+    if daemon in ("", version):
+        return "", ""
+    text = f"the nodes' dora is {version}, the daemon is {daemon}"
+    return text, f"{install} dora-rs=={daemon}"

@@ -26,7 +26,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import reached
 from dora_systemd.trust.sight import Sight
 from dora_systemd.values import shown
-from dora_systemd.verbs.start.programs import version_warnings
+from dora_systemd.verbs.start.programs import version_trouble
 from dora_systemd.verbs.start.where import Look, Where
 
 
@@ -84,7 +84,10 @@ def start_warnings(where: Where, dataflow: Dataflow, sight: Sight) -> Iterator[s
     """Warn of what keeps Python nodes from working. Raises DoraSystemdError for what must."""
     yield from unbuilt_warnings(where.options, sight)
     if any(node.kind in (NodeKind.PYTHON, NodeKind.OPERATOR) for node in dataflow.nodes):
-        yield from version_warnings(_nodes_venv(where.options, sight), where.options.dora, sight)
+        venv = _nodes_venv(where.options, sight)
+        text, remedy = version_trouble(venv, where.options.dora, sight)
+        if text:
+            yield f"{text}: {remedy}"
 
 
 def _nodes_venv(options: RunnerOptions, sight: Sight) -> str | None:

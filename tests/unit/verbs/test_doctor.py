@@ -134,8 +134,9 @@ def test_nodes_with_another_dora(manager: FakeManager, scope: Scope, tmp_path: P
     venv = install(tmp_path / "venv", "dora_rs", "1.0.1")
     prefix = install(tmp_path / "tool", "dora_rs_cli", "1.1.0")
     manager.add(options(venv=venv, dora=f"{prefix}/bin/dora"))
-    expected = "robot: the nodes' dora is 1.0.1, the daemon is 1.1.0: "
-    assert found(manager, scope)["versions"].text.startswith(expected)
+    finding = found(manager, scope)["versions"]
+    assert finding.text == "robot: the nodes' dora is 1.0.1, the daemon is 1.1.0"
+    assert finding.remedy.endswith("dora-rs==1.1.0")
 
 
 def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:

@@ -398,6 +398,9 @@ def test_absolute_paths(tmp_path: Path) -> None:
         ("", ""),
         ("error: Failed to initialize cache at `/.cache/uv`", "--property CacheDirectory=NAME"),
         ("[ WARN:0] VIDEOIO(V4L2:/dev/video0): can't open camera by index", "--device PATH"),
+        ("qt.qpa.xcb: could not connect to display :0", "BindReadOnlyPaths=/tmp/.X11-unix"),
+        ("_tkinter.TclError: no display name and no $DISPLAY environment variable", "DISPLAY=:0"),
+        ("gtk: Cannot open display: ", "--env DISPLAY=:0"),
     ],
 )
 def test_signs_of_the_sandbox(line: str, words: str) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.sight import Sight
-from dora_systemd.verbs.start.programs import check_program, daemon_dora, version_warnings
+from dora_systemd.verbs.start.programs import check_program, daemon_dora, version_trouble
 from tests.unit.decisions.cell.test_programs import elf
 from tests.unit.fakes.programs import make_program
 
@@ -129,19 +129,24 @@ def test_versions_of_nodes_and_daemon(tmp_path: Path) -> None:
     venv, other = install(tmp_path / "v", "dora_rs", "1.0.1"), tmp_path / "dora"
     install(other, "dora_rs_cli", "1.1.0", "python3.11")
     dora, sight = f"{other}/bin/dora", Sight()
-    (warning,) = version_warnings(venv, dora, sight)
-    expected = f"the nodes' dora is 1.0.1, the daemon is 1.1.0: {venv}/bin/python -m pip install "
-    assert warning == f"{expected}dora-rs==1.1.0"
-    assert not list(version_warnings(None, dora, sight))
-    assert not list(version_warnings(venv, str(tmp_path / "nowhere/dora"), sight))
-    assert not list(version_warnings(install(tmp_path / "w", "dora_rs", "1.1.0"), dora, sight))
+    text, remedy = version_trouble(venv, dora, sight)
+    assert text == "the nodes' dora is 1.0.1, the daemon is 1.1.0"
+    assert remedy == f"uv pip install --python {venv} dora-rs==1.1.0"
+    make_program(Path(venv) / "bin/pip")
+    assert version_trouble(venv, dora, sight)[1] == f"{venv}/bin/pip install dora-rs==1.1.0"
+    for nothing in (
+        version_trouble(None, dora, sight),
+        version_trouble(venv, str(tmp_path / "nowhere/dora"), sight),
+        version_trouble(install(tmp_path / "w", "dora_rs", "1.1.0"), dora, sight),
+    ):
+        assert nothing == ("", "")
 
 
 def test_nodes_that_no_daemon_takes(tmp_path: Path) -> None:
     """dora 0.5 cannot read the configuration that a daemon of dora 1 gives its nodes."""
     venv = install(tmp_path, "dora_rs", "0.5.0")
     with pytest.raises(DoraSystemdError, match=r"their dora is 0\.5\.0, 1\.0 or newer") as caught:
-        list(version_warnings(venv, "/nowhere/dora", Sight()))
+        version_trouble(venv, "/nowhere/dora", Sight())
     assert caught.value.code is ExitCode.BAD_INPUT
 
 
