@@ -23,7 +23,7 @@ pip install --quiet --no-deps --no-index /out/*.whl
 dora --version
 status=0
 python -m tests.canary.help_tree || status=1
-pytest -q --tb=short -rfE "$@" || status=1
+pytest -q --tb=line -rfE "$@" || status=1
 exit $status
 """
 

@@ -12,7 +12,10 @@ from lab.image import CERTIFICATES, debian_command, run_in_tree, tree_environmen
 from lab.process import need_tools, run_logged
 
 # For the tests and for nodes: a user's dataflow has an environment of its own too.
-TEST_TOOLS = [name for name in definition.PYPI if not name.startswith("dora-rs-cli")]
+TEST_TOOLS = [
+    *(name for name in definition.PYPI if not name.startswith("dora-rs-cli")),
+    "websockets>=14",  # for clients of the tests: Debian 12 has none that waits
+]
 # Of these, PyPI has no wheels: `make wheels` builds them, and they need the others.
 COMPILED = {"pystemd": ("lxml", "psutil"), "systemd-python": ()}
 # systemd 262 needs /proc to write the journal's catalog.
