@@ -29,6 +29,8 @@ WITH_ROBOT = tuple(
 )
 """Pages about a robot that is already in PLACE."""
 PLACE, ARM = Path("/srv/robot"), Path("/srv/arm")
+LEFT = "/srv/records /etc/systemd/system/tell.service"
+"""What pages make elsewhere."""
 EXAMPLES = Path("/usr/share/doc/dora-systemd/examples")
 
 
@@ -59,7 +61,7 @@ def shell(installed: None) -> Iterator[Shell]:
     yield shell
     shell.end()
     sh("doractl destroy --force")
-    sh(f"rm -rf {PLACE} {ARM}")
+    sh(f"rm -rf {PLACE} {ARM} {LEFT}")
 
 
 @pytest.mark.parametrize("page", [*FROM_NOTHING, *WITH_ROBOT])
