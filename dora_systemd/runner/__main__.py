@@ -57,7 +57,7 @@ def begin(argv: list[str]) -> "Begun | None":
 def begin_shared(
     options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
 ) -> "Begun":
-    """The same for one of several machines. Raises OSError, DoraSystemdError."""
+    """Start dora as begin() does, on one of several machines. Raises OSError, DoraSystemdError."""
     boot: EarlyDaemon
     if options.machine:
         from dora_systemd.runner.machines.boot import MemberBoot

@@ -1,10 +1,10 @@
 """Runs the commands of a build: `python3 -m dora_systemd.runner.build TASK`.
 
-`doractl deploy` starts it in a unit of its own, as the user of the nodes, in their sandbox. It
-writes what they print to the journal with the fields of the dataflow, and the last line of it to
-STATUS=. For `doractl build` it writes the lines to standard output, and a refusal to standard
-error. Its standard input is a pipe that doractl holds: if that ends, doractl is gone, and so is
-the build. In a unit systemd also kills what this program leaves.
+`doractl deploy` starts this program in a unit of its own, as the user of the nodes, in their
+sandbox. The program writes the output of the commands to the journal with the fields of the
+dataflow, and the last line to STATUS=. For `doractl build` it writes the lines to standard output,
+and a refusal to standard error. Standard input is a pipe that doractl holds: at its end doractl is
+gone, and the program stops the build. In a unit systemd also kills the processes that are left.
 """
 
 import os
@@ -62,7 +62,7 @@ class Sink(Protocol):
     """Where the lines of a build go."""
 
     def write(self, line: bytes, words: str) -> None:
-        """Take a line. words: the line as people read it. Raises Gone if nobody reads it."""
+        """Write a line. words: the line as it is shown. Raises Gone if nobody reads the output."""
 
     def close(self) -> None:
         """Wait until all lines are read. Raises OSError."""

@@ -36,8 +36,8 @@ KILL_SECONDS = 2.0
 READ_SECONDS = 1.0
 KILLED_SECONDS = 0.005
 ALL_SECONDS = 8.0
-"""For all steps together. systemd allows as much as for a stop, at least STOP_MARGIN in
-dora_systemd.decisions.life.stop_budget; the start of Python is part of that."""
+"""Time for all steps together. systemd allows as much as for a stop, at least STOP_MARGIN in
+dora_systemd.decisions.life.stop_budget, including the start of Python."""
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
@@ -133,7 +133,7 @@ def read_logs_of_dora(
     tails = {}
     for path in sorted(io.iterdir()):
         put = partial(pipes.write_fields, node=path.stem)
-        # A damaged note of one node must not cost the lines of the others.
+        # A damaged file of one node must not prevent reading the lines of the others.
         with contextlib.suppress(OSError, ValueError):
             if path.suffix == PLACE_SUFFIX and (tail := resume_tail(loop, path, put)):
                 tails[path.stem] = tail

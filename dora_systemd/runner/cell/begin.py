@@ -17,7 +17,7 @@ from dora_systemd.paths import CellPaths
 
 _SIGACTIONS = {"x86_64": "13", "aarch64": "134", "riscv64": "134"}
 SIGACTION = {"DORA_SYSTEMD_SIGACTION": _SIGACTIONS.get(os.uname().machine, "")}
-"""For launcher.pl: the number of rt_sigaction(2)."""
+"""The variable that gives launcher.pl the number of rt_sigaction(2)."""
 LIBEXEC = Path(__file__).parents[2] / "libexec"
 OPENSSL = ("ssl", "_ssl", "_hashlib")
 

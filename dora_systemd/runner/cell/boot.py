@@ -63,7 +63,7 @@ class EarlyDaemon:
 
 
 class Boot(EarlyDaemon):
-    """EarlyDaemon of a machine whose coordinator has been started."""
+    """EarlyDaemon of a machine that runs the coordinator, which is started already."""
 
     def __init__(
         self,

@@ -58,9 +58,9 @@ class Dialogue(Tasks):
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
     ) -> dict[Do, Callable[[], None]]:
-        """The function for each Do.
+        """Return the function for each Do.
 
-        variables: what the daemon's environment has besides the nodes'.
+        variables: added to the nodes' environment for the daemon.
         """
         self._watch_nodes()
         return {

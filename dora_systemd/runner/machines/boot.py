@@ -44,10 +44,10 @@ GREETED = "greeted"
 _FD = struct.Struct("i")
 _ZENOH = Path(__file__).parents[2] / "zenoh-machines.json5"
 _NO_DIRECT = {"DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS": "0"}
-"""Where ssh carries the messages, nodes of different machines do not dial each other: the addresses
-would be those of 127.0.0.1. So dora must not wait for them either; it would for 1.5 s."""
+"""Where ssh carries the messages, nodes of different machines do not connect to each other: the
+addresses would be those of 127.0.0.1. So dora must not wait 1.5 s for such connections."""
 _OVERLAYS = ("ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY")
-"""Variables by which a user sets the same: dora refuses both."""
+"""Variables with which a user configures zenoh: dora refuses them next to an overlay of ours."""
 
 
 def choose_ports(
@@ -80,14 +80,14 @@ def shared_environment(environment: Mapping[str, str], addresses: Sequence[str])
 def head_arguments(
     ports: Forwards, environment: Mapping[str, str], addresses: Sequence[str]
 ) -> tuple[str, ...]:
-    """What the daemon of the head needs to meet those of other machines."""
+    """Return the arguments by which the daemon of the head connects to those of members."""
     return _arguments(ports.zenoh[HEAD], environment, addresses)
 
 
 def member_arguments(
     part: Part, environment: Mapping[str, str], addresses: Sequence[str]
 ) -> tuple[str, ...]:
-    """The same for the daemon of a member, which also needs its name."""
+    """Return the arguments of the daemon of a member, with the machine's name."""
     return ("--machine-id", part.machine, *_arguments(part.zenoh, environment, addresses))
 
 

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
 
 FIRST_PATIENCE = 30 * SECOND
-"""µs that a start waits for members if somebody waits for it, and the settings have no timeout."""
+"""µs that a start by hand waits for members if the settings have no timeout."""
 _AGAIN_SECONDS = 0.05
 _LOOK_SECONDS = 0.2
 _WATCH_SECONDS = 2.0
@@ -217,7 +217,7 @@ class HeadDialogue(Dialogue):
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
     ) -> dict[Do, Callable[[], None]]:
-        """As for one machine, and what comes with several."""
+        """Return the actions of a single machine, with those that several machines need."""
         return {
             **super().actions(descriptor, variables),
             Do.GATHER: lambda: self._ask(Do.GATHER, self._gather()),
@@ -289,7 +289,7 @@ class HeadDialogue(Dialogue):
             self._loop.call_later(after / SECOND, self._pump.push, late)
 
     async def _watch_machines(self) -> None:
-        """Find a member that is there, and whose daemon is not or hangs."""
+        """Find a connected member whose daemon has disconnected or hangs."""
         gaps = Gaps(self._loop.time)
         while True:
             with gaps.within(_WATCH_SECONDS):
@@ -388,7 +388,7 @@ class HeadDialogue(Dialogue):
             self._ask(Do.END_NODES, self._end_nodes())
 
     async def _end_nodes(self) -> None:
-        """End what is here, while the members do the same."""
+        """End the nodes of this machine, while the members end theirs."""
         left = self._begin_end()
         self._roster.close()
         self._roster.tell(wire.StopPart(min(round(left * SECOND), self._pump.cell.grace)))

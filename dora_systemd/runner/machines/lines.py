@@ -1,7 +1,7 @@
-"""One side of the talk between head and member, see decisions/machines/wire.py.
+"""One side of the connection between head and member, see decisions/machines/wire.py.
 
-A side is silent if nothing has come for LEASE_SECONDS. That is counted in own beats: a process that
-the kernel has held up itself must not take its own silence for that of the other side.
+A side is silent if it has sent nothing for LEASE_SECONDS. The other side counts that time in its
+own heartbeats: a process that did not run for a while must not conclude that the peer was silent.
 """
 
 import asyncio
@@ -82,7 +82,7 @@ class Lines:
                     self.end(self._why)
                     return
                 hear(parse_message(line))
-                await asyncio.sleep(0)  # lines that are there already must not hold up the rest
+                await asyncio.sleep(0)  # a queue of lines must not block other tasks
 
     def _break(self, why: str) -> None:
         self._why, self.is_broken = why, True

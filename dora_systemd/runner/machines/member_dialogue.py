@@ -41,7 +41,7 @@ class Voice(Protocol):
     stops_by_head: bool  # the head knows that this part ends
     grace: int  # µs that the head leaves the nodes
     is_answered: asyncio.Event  # the head ends its own part, or is gone
-    is_going_down: Callable[[bool], bool]  # whether systemd, or that of the user, stops everything
+    is_going_down: Callable[[bool], bool]  # whether the machine, or the user's manager, shuts down
 
     def send(self, message: wire.Message) -> None:
         """Send a message to the head, if the head is connected."""

@@ -145,7 +145,7 @@ class Roster:
         return [name for name, one in self._members.items() if not one.is_heard]
 
     def tell(self, message: wire.Message) -> None:
-        """Send a message to all that are there."""
+        """Send a message to all connected members."""
         for one in self._members.values():
             if one.lines is not None:
                 one.lines.send(message)

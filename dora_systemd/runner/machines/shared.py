@@ -44,7 +44,7 @@ class Shared(Alone):
 
 
 ASK_SECONDS = 5.0
-"""A coordinator that waits for a machine answers nobody for half a minute."""
+"""Timeout of a request: a coordinator that waits for a machine does not answer for 30 s."""
 NOISE = (
     b"Gossip is disabled: cannot de-duplicate",
     b"Scouting delay elapsed before start conditions are met",
@@ -98,16 +98,16 @@ class MemberEngine(SharedEngine):
             daemon.send_signal(signal.SIGKILL)
 
     def _write_access(self, daemon: Daemon) -> None:
-        """Requests to the coordinator are the head's."""
+        """Write nothing: only the head sends requests to the coordinator."""
 
     async def find_silent(self, seconds: float) -> str:
-        """Nothing: the head sees whether the daemon hangs."""
+        """Return "": only the head finds out whether the daemon hangs."""
         del seconds
         return ""
 
 
 _MOST_BYTES = 32 << 20
-"""Of one file: a larger one is not compared."""
+"""Maximum bytes of a file that is compared."""
 
 
 def own_digests(
@@ -156,7 +156,7 @@ async def end_nodes(nodes: Nodes, own: Iterable[str], seconds: float) -> None:
 
 
 async def _end(group: Path) -> None:
-    """Return when no process of the group is left. One that comes meanwhile gets the signal too."""
+    """Send SIGTERM to the processes of a group, also to new ones, until none is left."""
     told: set[int] = set()
     while pids := {*cgroup.pids(group)}:
         for pid in pids - told:

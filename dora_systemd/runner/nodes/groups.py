@@ -79,8 +79,8 @@ def _load(path: Path, key: str, samples: tuple[CpuSample, ...], now: CpuSample) 
 class Hold:
     """Freezes the cgroup of one node while too many bytes of its output are unread.
 
-    Only nodes whose output dora's daemon reads: one with pipes blocks in write(2) instead. The
-    kernel freezes a group by cgroup.freeze, see cgroups(7).
+    Only for nodes whose output dora's daemon reads: a node with pipes blocks in write(2) instead.
+    The kernel freezes a group by cgroup.freeze, see cgroups(7).
     """
 
     def __init__(self, group: Path, marks: Marks) -> None:
@@ -110,7 +110,7 @@ class Hold:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Thaw the node meanwhile: it must get dora's message that another process replaces it."""
+        """Keep the node thawed in the context: it must receive dora's message of its end."""
         self._is_paused = True
         self.look(0)
         try:
@@ -119,6 +119,6 @@ class Hold:
             self._is_paused = False
 
     def end(self) -> None:
-        """Thaw the node for good: it must get dora's request to stop."""
+        """Thaw the node and never freeze it again, so that it receives dora's request to stop."""
         self._is_over = True
         self.look(0)

@@ -1,6 +1,6 @@
-"""The gates of nodes: a launcher waits at one before it executes the node's program.
+"""The gates of nodes: a launcher waits at a gate before it executes the node's program.
 
-Nodes with needs have one, and nodes that somebody has stopped.
+Nodes with needs have a gate, and nodes that were stopped by a request.
 
 A gate is a FIFO. launcher.pl opens it for reading, which waits until the runner has it open, and
 reads one word. So a gate is open for as long as the runner holds its descriptor and the FIFO
@@ -50,7 +50,7 @@ class Gates:
             os.mkfifo(self._paths.node_gate(node), 0o600)
 
     def reset(self, node: str) -> None:
-        """As before the run: the gate of a node with needs is closed, no other one has a gate."""
+        """Close the gate of a node with needs; remove the gate of any other node."""
         if node in self._known:
             self.close(node)
         if not self.is_for_needs(node):
@@ -106,7 +106,7 @@ class Gates:
         if self._is_over and not is_last:
             return
         if node not in self._open:
-            # Both ends: that never waits, and there is a reader while no launcher is there.
+            # For reading, too: then open(2) does not wait, and the FIFO has a reader at any time.
             flags = os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
             self._open[node] = os.open(self._paths.node_gate(node), flags)
         fd = self._open[node]

@@ -120,7 +120,7 @@ class Nodes:
         limit_groups((self._group(one.node), one) for one in limits)
 
     def remove(self, node: str) -> None:
-        """Remove the group and pipes of a node that has ended for good. Raises OSError."""
+        """Remove the group and pipes of a node that will not start again. Raises OSError."""
         if hold := self._holds.pop(node, None):
             hold.end()
         cgroup.kill_group(self._group(node))

@@ -1,7 +1,7 @@
 """The watchdogs of nodes: their notify sockets, and the end of nodes that miss one.
 
-Each node has its own socket, so that one that sends too much only holds up itself. A message is
-believed if the kernel knows its sender to be in the cgroup of the node. A node that misses its
+Each node has its own socket, so that a node that sends too much only delays itself. A message is
+accepted if its sender is in the cgroup of the node, according to the kernel. A node that misses its
 watchdog is ended as systemd ends a service: by SIGABRT, then by SIGKILL. dora then restarts the
 node by its policy, as after any other crash.
 """

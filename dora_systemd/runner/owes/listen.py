@@ -1,8 +1,8 @@
-"""Notes when messages of nodes arrive: `python listen.py FILE SECONDS`, as a node of dora's.
+"""Records when messages of nodes arrive: `python listen.py FILE SECONDS`, as a node of dora's.
 
 FILE is the file of times of dora_systemd/decisions/owes/probe.py, and SECONDS the time between two
-beats at most. The input "0" is the first owed output. This runs with the Python of the nodes: it
-imports nothing of dora_systemd, and of others only dora.
+beats at most. The input "0" is the first owed output. The program runs with the Python of the
+nodes, so it imports nothing of dora_systemd, and no other package than dora.
 """
 
 import mmap
@@ -24,9 +24,9 @@ class Ignored(type):
 
 
 def leave_out_arrow() -> None:
-    """Have dora find a pyarrow that makes nothing of the data: nobody looks at it here.
+    """Replace pyarrow by a stub for dora, because the probe does not read the data.
 
-    The real one takes 50 MB, and would copy each message.
+    The real pyarrow takes 50 MB, and would copy each message.
     """
     arrow = types.ModuleType("pyarrow")
     vars(arrow)["__getattr__"] = lambda name: Ignored(name, (), {})
@@ -34,7 +34,7 @@ def leave_out_arrow() -> None:
 
 
 def listen(node: Any, times: memoryview, seconds: float) -> None:
-    """Note beats and messages until the node is stopped, or one of its inputs ends.
+    """Record beats and messages until the node is stopped, or one of its inputs ends.
 
     The runner then starts another probe for the inputs that are left.
     """

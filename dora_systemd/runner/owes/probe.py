@@ -77,9 +77,9 @@ class Probe:
             await self._add(inputs)
 
     def heard(self, beat: int) -> tuple[int, int]:
-        """The number of the probe that has noted `beat`, and the beat; 0 if that probe has gone.
+        """Return the number of the last probe, and its beat: 0 if that probe has ended.
 
-        Messages that come before the next one listens are noted by nobody.
+        Messages between the end of a probe and the start of the next are not recorded.
         """
         is_own = beat > self._added_us
         if is_own:
@@ -87,9 +87,9 @@ class Probe:
         return self._number, beat if is_own and cgroup.is_populated(self._group) else 0
 
     def _inputs(self) -> list[tuple[int, str]]:
-        """The outputs of nodes that have not ended for good, each with its slot.
+        """Return the outputs of nodes that run or may start again, each with its slot.
 
-        None if all nodes that owe something have ended.
+        Empty if all nodes that owe something have ended.
         """
         nodes, owes = self._run.pump.cell.nodes, self._plan.options.owes
         if not any(_can_come(nodes.get(one.node)) for one in owes):
@@ -130,7 +130,7 @@ class Probe:
         return probe_definition(self._count, command, (PERL, self._plan.launcher), inputs)
 
     def _tell(self, reason: str) -> None:
-        """Report once that nobody watches, until a probe has lived for a while."""
+        """Report that the outputs are not watched, once until a probe has run for a while."""
         if not self._is_told and self._run.pump.cell.state is State.RUNNING:
             self._is_told = True
             self._run.pipes.write_event("outputs-unwatched", reason=reason)

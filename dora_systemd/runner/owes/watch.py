@@ -68,7 +68,7 @@ class Watch:
         """Look again and again; the probe is started, and again if it has ended."""
         loop = asyncio.get_running_loop()
         while True:
-            # CLOCK_MONOTONIC: it stands while the machine is suspended, and nobody sets it.
+            # CLOCK_MONOTONIC stops while the machine is suspended, and cannot be set.
             now = int(loop.time() * SECOND)
             beat, heard = parse_times(self._times.read(), len(self._judge.feeds.places), now)
             number, fresh = self._probe.heard(beat)

@@ -110,7 +110,7 @@ class Reloader:
             self._noting = asyncio.create_task(asyncio.to_thread(self._note_imports))
 
     def _note_imports(self) -> None:
-        """Note the versions of modules, unless that was done in this run. Blocks."""
+        """Record the versions of imported modules, once in each run. Blocks."""
         with self._noting_lock, contextlib.suppress(DoraSystemdError):  # a program has gone
             current = self.current
             if current is not None and not self._has_imports:
@@ -279,9 +279,9 @@ class Reloader:
         return await self._restart(run, change, reason)
 
     async def _undo(self, applier: Applier, change: Change, error: NotReady) -> DoraSystemdError:
-        """Go back to the old descriptor; an old version of a program file no longer exists.
+        """Restore the old descriptor; an old version of a program file no longer exists.
 
-        Dora starts no node again that has failed for good: then the next run has the old version.
+        dora does not restart a node without restarts left: then the next run has the old version.
         """
         if change.prepared is self.current:
             return DoraSystemdError(f"cannot use what was saved: {error}")

@@ -30,31 +30,31 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import let_openssl_in
 
 _LONGEST_SECONDS = 10.0
-"""For which a client that turns on hot reload waits for a large tree."""
+"""Maximum time that the client waits for the watches of a large tree, to turn on hot reload."""
 
 
 class Versions:
     """The identities of the files that each node runs.
 
-    A file of the dataflow itself, such as its settings, stands in the place of a node.
+    A file of the dataflow itself, such as the settings file, has an entry with its path as node.
     """
 
     def __init__(self) -> None:
         self._known: dict[str, dict[str, Identity | None]] = {}
 
     def take(self, node: str, paths: Iterable[str]) -> None:
-        """Note that `node` runs the present versions of `paths`, and no other files."""
+        """Record that `node` runs the present versions of `paths`, and no other files."""
         self._known[node] = _identities(paths)
 
     def merge(self, taken: "Versions") -> None:
-        """Note what was taken before, once it is true."""
+        """Take over the versions that were recorded in `taken`, once the nodes run them."""
         self._known |= taken._known
 
     def add(self, node: str, paths: Iterable[str], begun_ns: int) -> None:
-        """Note the present versions of those `paths` that are not known yet.
+        """Record the present versions of those `paths` that are not known yet.
 
-        A file that was written since `begun_ns` stays unknown: the node may run an older version.
-        One that seems to be written later than now is from before somebody set the clock.
+        A file that was written since `begun_ns` stays unknown: the node may run an older version. A
+        file with a later time than now was written before the clock was set back.
         """
         known = self._known.setdefault(node, {})
         present = _identities(set(paths) - known.keys())
@@ -69,11 +69,11 @@ class Versions:
             yield from list(files.items())
 
     def differ(self, path: str) -> bool:
-        """Whether a file of the dataflow itself is another one, or has come or gone."""
+        """Return whether a file of the dataflow itself was changed, created or removed."""
         return self._known.get(path, {}).get(path) != identity(path)
 
     def stale(self, node: str, paths: Iterable[str]) -> set[str]:
-        """Return those `paths` of which another version is there than `node` runs."""
+        """Return those `paths` that exist in another version than `node` runs."""
         known = self._known.get(node, {})
         now = _identities(paths)
         return {path for path, one in now.items() if one is not None and known.get(path) != one}

@@ -171,7 +171,7 @@ class Swapper:
             raise DoraSystemdError(f"cannot do that in dora: {protocol.first_line(reply.error)}")
 
     async def begin(self, params: protocol.Params) -> None:
-        """Have dora start a process, unless a stop of the dataflow has come meanwhile."""
+        """Have dora start a process, unless the dataflow is stopped meanwhile."""
         if self._pump.cell.state is State.RUNNING:
             await self.ask(params)
 
