@@ -1,7 +1,7 @@
 """One connection of the gateway: an HTTP request, and what follows it.
 
-It is the protocol layer of websockets over asyncio's streams, as the client of dora's coordinators
-is: the same for all versions of websockets that distributions have.
+Uses the protocol layer of websockets over asyncio's streams, as the client of dora's coordinators
+does: that layer is equal in all versions of websockets that distributions have.
 """
 
 import asyncio

@@ -45,8 +45,8 @@ _REASON_BYTES = 120
 """Just below what a closing frame can have."""
 
 _THREADS = 64
-"""Blocking calls at the same time, such as stops of dataflows with a long grace duration. asyncio
-itself allows a few more than the machine has processors: one page could hold up all others."""
+"""Blocking calls in parallel, such as stops of dataflows with a long grace duration. The default of
+asyncio is a few more than the machine has processors: one page could block all others."""
 
 _ALWAYS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 

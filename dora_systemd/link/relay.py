@@ -47,7 +47,7 @@ class Relay:
                 self._write(1 if fd else self._runner, data)
 
     def _write(self, fd: int, data: bytes) -> None:
-        """Write all, but no longer than the lease: nobody may read it any more."""
+        """Write all data, but give up after the lease: the other side may not read any more."""
         while data:
             self._wait((fd,), select.POLLOUT)
             try:
@@ -86,7 +86,7 @@ def _say_end(fd: int) -> None:
 
 
 def _end_session() -> None:
-    """End the sshd that this is a child of. It is of the same user, or the kernel refuses."""
+    """End the sshd whose child this process is. The kernel refuses for an sshd of another user."""
     # Imported late: it takes half a megabyte, and is needed at the end only.
     import signal
 

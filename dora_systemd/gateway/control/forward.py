@@ -1,8 +1,8 @@
 """Forwards requests that only a dataflow's coordinator can answer, and passes topics through.
 
-Here a dataflow has one UUID as long as it exists; in its cell each run has another one. Requests
-get the UUID of the run, answers that of the dataflow. Frames of topics pass unchanged: they begin
-with the id of a subscription, which each coordinator chooses itself.
+A client of the gateway sees one UUID of a dataflow as long as the dataflow exists; in the cell each
+run has its own UUID. Requests get the UUID of the run, answers that of the dataflow. Frames of
+topics pass unchanged: they begin with the id of a subscription, which each coordinator chooses.
 """
 
 import asyncio

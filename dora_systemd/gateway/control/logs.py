@@ -128,7 +128,7 @@ async def subscribe_logs(talk: Talk, request: Request) -> Result:
 
 
 class Follower:
-    """Sends what a dataflow writes, until it has ended for good.
+    """Sends the lines of a dataflow until it has ended and waits for no restart.
 
     since_us: CLOCK_REALTIME µs. level: dora's name of a level, see is_wanted.
     """

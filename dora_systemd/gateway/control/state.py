@@ -32,7 +32,7 @@ from dora_systemd.verbs.why import explain, words_of_start
 _MOST_ENDED = 20
 """Maximum number of dataflows that ended earlier in `dora list`."""
 _FRESH_SECONDS = 5.0
-"""For which the journal's answer about ended dataflows is good, at most."""
+"""Maximum age of the journal's answer about ended dataflows."""
 
 
 def list_dataflows(scope: Scope) -> dict[str, Any]:

@@ -61,7 +61,7 @@ async def restart(talk: Talk, request: Request) -> dict[str, Any]:
 
 
 def _note_stop(scope: Scope, cell: Cell) -> None:
-    """Note who stops a dataflow and, with it, those that need it."""
+    """Record in the journal who stops a dataflow and, with it, the dataflows that need it."""
     note_stop([cell], "dora stop")
     note_stop(find_dependents(Bus(scope), [cell]), f"dora stop {cell.name}")
 

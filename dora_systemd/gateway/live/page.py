@@ -43,7 +43,7 @@ QUESTIONS: Mapping[str, Callable[[Scope, str], dict[str, Any]]] = {
     "releases": read_own_releases,
 }
 _STREAMS = ("follow", "find", "unfollow")
-"""Each ends the one before it."""
+"""Messages that start or end a stream of lines; each ends the stream before it."""
 
 
 class Means(NamedTuple):
@@ -79,7 +79,7 @@ async def _end(tasks: set["asyncio.Task[None]"]) -> None:
 
 
 class Page:
-    """One page in a browser. is_due: a snapshot is."""
+    """One page in a browser. is_due: set when the page needs a snapshot."""
 
     def __init__(self, socket: Socket, scope: Scope, means: Means = _MEANS) -> None:
         self._socket = socket
