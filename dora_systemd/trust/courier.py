@@ -80,7 +80,7 @@ class Rules:
 
     @staticmethod
     def _spec(lines: list[str]) -> Any:
-        """Of all lines that are patterns; one that is not matches nothing, as in git."""
+        """Parse all valid patterns among the lines; an invalid line matches nothing, as in git."""
         from pathspec import GitIgnoreSpec
 
         sound = []
@@ -105,7 +105,7 @@ class Rules:
         self._own[prefix] = self._spec(lines)
 
     def ignore(self, directory: str, entry: "os.DirEntry[str]") -> bool:
-        """Whether an entry of a directory is left out."""
+        """Return whether a release leaves out an entry of a directory."""
         path = joined(directory, entry.name)
         path += "/" if entry.is_dir(follow_symlinks=False) else ""
         return bool(self._always.match_file(path)) or any(

@@ -1,7 +1,7 @@
-"""Looks at paths for a Sight; imports the standard library only.
+"""Checks paths for a Sight; imports the standard library only.
 
-sight.py uses answer() for the caller. For another user, it has a child process of that user run the
-text of this file: that user may not be able to read our package.
+sight.py calls answer() for the caller. For another user, sight.py has a child process of that user
+run the text of this file: that user may not be able to read our package.
 """
 
 import errno

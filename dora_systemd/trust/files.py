@@ -60,7 +60,7 @@ def read_file(path: str | Path, max_bytes: int = MAX_BYTES) -> Text:
     try:
         with reached(path) as (found, place):
             check_regular(place.mode)
-            # The same file again, now to be read: see proc_pid_fd(5).
+            # Open the file again, for reading, by its descriptor: see proc_pid_fd(5).
             data = read_regular(f"/proc/self/fd/{found}", max_bytes + 1)
     except (OSError, ValueError) as error:
         raise unreadable(path, error) from error

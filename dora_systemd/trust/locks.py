@@ -1,7 +1,7 @@
-"""The lock file in the RuntimeDirectory of a dataflow, to which root's doractl is a stranger.
+"""The lock file in the RuntimeDirectory of a dataflow, which root's doractl must not trust.
 
 The directory belongs to the nodes' user, who can put anything there. The file is opened by
-descriptor, must be a regular file of that user, and nothing here waits.
+descriptor and must be a regular file of that user. No function of this module waits.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from dora_systemd.trust.paths import STEP, Place, reached, refusal
 T = TypeVar("T")
 
 _MOST_BYTES = 64 * 1024
-"""Of the reasons in the file, the last ones."""
+"""Bytes of reasons that are read from the end of the file."""
 
 
 class LockPlace(NamedTuple):
@@ -51,9 +51,9 @@ def place_of(lock: int) -> LockPlace:
 
 
 def take_lock(directory: Path, lock: int, is_shared: bool) -> bool:
-    """Lock the open lock file of a RuntimeDirectory, see flock(2); False if another one holds it.
+    """Lock the open lock file of a RuntimeDirectory, see flock(2); False if others hold a lock.
 
-    Raises DoraSystemdError if the kernel cannot lock at all, such as for want of memory (ENOLCK).
+    Raises DoraSystemdError if the kernel cannot lock at all, such as without memory (ENOLCK).
     """
     operation = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
     try:

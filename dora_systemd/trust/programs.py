@@ -105,7 +105,7 @@ def spawn(
 
 
 def become(account: Account) -> None:
-    """Change this process to the account for good. Raises OSError."""
+    """Change this process to the account; there is no way back. Raises OSError."""
     if account.uid != os.geteuid():
         os.setgroups(account.groups)
         os.setgid(account.gid)

@@ -55,7 +55,7 @@ class Patience:
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[float]:
-        """Count the time of the block; its deadline. Raises BrokenPipeError if none is left."""
+        """Measure the block, and yield its deadline. Raises BrokenPipeError if no time is left."""
         if self.left <= 0:
             raise BrokenPipeError
         begun = time.monotonic()
@@ -83,9 +83,9 @@ class Project:
         return self._entries({"ask": "list", "path": directory, "most": most})
 
     def walked(self, directory: str, most: int, always: Sequence[str]) -> list[list[Any]]:
-        """The same without what .gitignore leaves out, here and above, and the patterns `always`.
+        """Return what listed() returns, without what .gitignore files or `always` leave out.
 
-        Call it for each directory after the one that has it.
+        Call walked() for a directory before its subdirectories, which its .gitignore concerns, too.
         """
         rules = {"always": list(always), "libraries": _libraries()}
         ignore_file = courier.joined(directory, courier.IGNORE_FILE)

@@ -178,9 +178,9 @@ def cannot_reach(user: str, path: str) -> DoraSystemdError:
 
 
 def send(fd: int, data: bytes, deadline: float) -> None:
-    """Write all of it to the pipe `fd`, until `deadline` (seconds of the monotonic clock).
+    """Write all data to the pipe `fd` until `deadline` (seconds of the monotonic clock).
 
-    Raises BrokenPipeError if nobody takes it in time.
+    Raises BrokenPipeError if the reader does not take the data in time.
     """
     os.set_blocking(fd, False)  # a pipe has 64 KiB
     while data:

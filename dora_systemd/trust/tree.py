@@ -23,7 +23,7 @@ def strange_part(directory: str | Path) -> str:
         firm = Path(firm_part(path))
         if firm != path:
             return _strange_way(path, firm)
-        # All of the way is root's, so what it leads to stays the same.
+        # root owns all directories of the path, so nobody else can change what it leads to.
         return next(_strange(path.resolve()), "")
     except OSError as error:
         return f"cannot read {shown(str(error.filename or path))}: {error.strerror}"
