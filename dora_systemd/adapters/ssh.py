@@ -114,7 +114,7 @@ class Connection:
         return self._input.fileno() if self._input and not self._input.closed else -1
 
     def write(self, data: bytes) -> int:
-        """Write as much as goes now; the number of bytes. Raises OSError if nobody reads it."""
+        """Write without waiting; return the number of bytes. Raises OSError after ssh has ended."""
         with suppress(BlockingIOError):
             return os.write(self.input, data)
         return 0

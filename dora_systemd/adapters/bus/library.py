@@ -1,10 +1,10 @@
 """Imports pystemd.dbuslib without pystemd/__init__.py; no other module imports pystemd.
 
 pystemd/__init__.py imports lxml and the signatures of all unit properties, which takes longer than
-all of `doractl list`. During the import, an empty package with the same path takes its place. A
-function takes the place of pprint's, which dbuslib only needs for debugging, because pprint imports
-the compiler. All this happens in a module because Python runs a module once and lets other threads
-wait: the gateway has several.
+all of `doractl list`. During the import, an empty package with the same path replaces pystemd. A
+function of ours replaces that of pprint, which dbuslib only needs for debugging, because pprint
+imports the compiler. All this happens in a module because Python runs a module once and lets other
+threads wait: the gateway has several.
 """
 
 import sys

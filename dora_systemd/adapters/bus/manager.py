@@ -65,7 +65,7 @@ class Manager(Protocol):
         wait: bool,
         beside: Beside = (),
     ) -> str:
-        """Create and start a unit; the result of the job. Without `wait`, JOB_DONE at once.
+        """Create and start a unit; return the result of the job. Without `wait`, JOB_DONE at once.
 
         `beside`: units that are created at the same time, because this unit needs them.
         """
@@ -104,7 +104,7 @@ class Manager(Protocol):
         """Change properties of a loaded unit; runtime: only until the next boot."""
 
     def fileno(self) -> int:
-        """For poll(2): readable when properties of a unit that was started may have changed."""
+        """Return a descriptor for poll(2): readable when a started unit may have changed."""
 
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
         """The properties of a unit that changed since the last call; does not wait."""

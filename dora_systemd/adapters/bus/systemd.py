@@ -182,7 +182,7 @@ class Bus:
         return str(self._get("read systemd's version", "Version"))
 
     def property_types(self) -> dict[str, str]:
-        # All services have the same, and systemd answers for one that it does not know as well.
+        # All services have the same properties, and systemd answers for an unknown unit as well.
         action, path = "read the properties of services", _unit_path("dora.service")
         text = str(self._call(action, "Introspect", path=path, interface=INTROSPECTABLE))
         own = text.partition(f'<interface name="{BY_TYPE["service"].decode()}">')[2]

@@ -10,7 +10,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 
 
 def limit_groups(groups: Iterable[tuple[Path, NodeLimits]]) -> ExitStack:
-    """Set the limits of nodes' groups, all or none; the result can write back those of before.
+    """Set the limits of nodes' groups, all or none; closing the result restores the old limits.
 
     Raises DoraSystemdError if one does not take effect.
     """
@@ -48,6 +48,6 @@ def _restore_group(path: Path, texts: Mapping[str, str]) -> None:
 
 
 def _written(path: Path, file: str, text: str) -> str:
-    """What to write: for no CPUs those of the group above, or the kernel refuses it (EIO)."""
+    """Return the text to write: without CPUs those of the parent group, to prevent EIO."""
     is_empty = file == CPUS_FILE and not text.strip()
     return read_text(f"{path.parent}/{file}.effective").strip() if is_empty else text

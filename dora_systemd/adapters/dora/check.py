@@ -42,7 +42,7 @@ class DoraCheck:
             return "" if listens() else dora_version(options.dora, own_account(), environment)
 
         def check_dataflow() -> str:
-            # A member has the file of its head, and the same dora, which has accepted it there.
+            # A member has the file of its head and the same dora, which accepted the file there.
             return "" if options.machine else refusal_of_dora(options, environment)
 
         self._options = options
@@ -50,11 +50,11 @@ class DoraCheck:
         self._refusal = beside(check_dataflow)
 
     def beside(self, call: Callable[[], T]) -> T:
-        """Call `call`, which reads the dataflow, while the checks run; its result.
+        """Call `call`, which reads the dataflow, in parallel with the checks; return its result.
 
-        Its error takes precedence over that of dora about the same file: doractl reports it before
-        a start, too. Without access to the file, or without dora, that is the error; but not if the
-        file is missing, for dora may be missing with the whole project.
+        An error of `call` takes precedence over that of dora about the same file: doractl reports
+        that error before a start, too. Without access to the file, or without dora, that is the
+        error; but not if the file is missing, for dora may be missing with the whole project.
         """
         try:
             found = call()

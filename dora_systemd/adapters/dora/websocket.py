@@ -35,7 +35,7 @@ else:
     from websockets.connection import State
 
 OPEN_SECONDS = 35.0
-"""As long as for a request: a coordinator that waits for its daemon accepts nothing for 30 s."""
+"""Timeout of a connection: a coordinator that waits for its daemon accepts none for 30 s."""
 CHUNK = 1 << 16
 
 
@@ -114,7 +114,7 @@ class Stream:
 class WebSocket(Stream):
     """One connection to a server.
 
-    There is no limit on frames of the own cell: they may be as large as descriptors.
+    There is no limit on frames of this cell, which may be as large as descriptors.
     """
 
     _protocol: ClientProtocol

@@ -9,7 +9,7 @@ _HOST = "127.0.0.1"
 _RETRY_SECONDS = 0.05
 _CHUNK = 65536
 _ANY_PORT = 9
-"""Nothing is sent there: it is only for the choice of a route."""
+"""The port only serves to choose a route: nothing is sent there."""
 
 
 def source_address(address: str, wanted: str = "") -> str:

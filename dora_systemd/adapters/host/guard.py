@@ -54,7 +54,7 @@ def _guard(parent: socket.socket, end: Callable[[], None], lock: Path) -> NoRetu
         for one in (*SIGNALS, *_MORE):
             signal.signal(one, signal.SIG_IGN)
         nowhere = os.open(os.devnull, os.O_RDWR)
-        for stream in range(3):  # whoever reads our output to its end does not wait for this
+        for stream in range(3):  # a reader of our output must not wait for the child
             os.dup2(nowhere, stream)
         parent.send(_WORD)
         if not parent.recv(1):
@@ -68,7 +68,7 @@ def _close_others(kept: int, lock: Path) -> None:
     """Close what belongs to others: their connections, and the locks of other guards' parents."""
     own = lock.stat()
     for fd in [int(one.name) for one in Path("/proc/self/fd").iterdir()]:
-        with suppress(OSError):  # that of the list is gone
+        with suppress(OSError):  # the descriptor by which the directory was read is closed
             is_lock = os.path.samestat(os.fstat(fd), own)
             if fd > 2 and fd != kept and not is_lock:
                 os.close(fd)

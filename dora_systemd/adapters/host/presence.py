@@ -1,6 +1,6 @@
-"""Looks for paths that nodes need: whether they are there, and which directories to watch.
+"""Checks paths that nodes need: whether they exist, and which directories to watch.
 
-The runner does this with the rights and the view of its nodes, so nobody gains anything by it.
+The runner checks with the rights and the view of its nodes, so a node learns nothing new from it.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ def look_at(path: str) -> Presence:
 
 
 def watched_places(paths: Iterable[str]) -> set[str]:
-    """The directories in which one of `paths` can appear or disappear.
+    """Return the directories in which one of `paths` can appear or disappear.
 
     These are the nearest existing directories of each path and of the links on the way to it.
     """

@@ -19,7 +19,7 @@ PROC = Path("/proc")
 _MOST_BYTES = 256 * 1024
 _SOCKET = re.compile(r"socket:\[(\d+)\]")
 _MOST_OF_LOCKS = 8 * 1024 * 1024
-"""Of /proc/locks: 100,000 locks."""
+"""Bytes read of /proc/locks: 100,000 locks."""
 _MOST_OF_PROCESS = 4096
 _FLOCK = re.compile(rb"\d+: FLOCK +\S+ +(?:READ|WRITE) +(\d+) ([0-9a-f]+:[0-9a-f]+):(\d+) ")
 
@@ -82,7 +82,7 @@ def _is_node(path: Path) -> bool:
 
 
 def beginning(path: Path, size: int = _MOST_BYTES) -> bytes:
-    """At most `size` bytes of a file: arguments can have megabytes, and there are many processes.
+    """Read at most `size` bytes of a file: arguments can have megabytes, and processes are many.
 
     Raises OSError.
     """

@@ -35,8 +35,8 @@ def read_base(bound: Mapping[str, str] | None = None) -> Base:
 def prove_rights(rights: Sequence[NodeRights], run: Callable[..., Completed] = run_command) -> None:
     """Have a child of this process take the rights of each node, by `run`.
 
-    The kernel decides by limits, capabilities, cgroup and sandbox together, so nobody can foretell
-    the answer. Raises DoraSystemdError (NO_PERMISSION) with the one that it refuses.
+    The kernel decides by limits, capabilities, cgroup and sandbox together, so only a trial shows
+    the answer. Raises DoraSystemdError (NO_PERMISSION) with the right that the kernel refuses.
     """
     if not rights:
         return

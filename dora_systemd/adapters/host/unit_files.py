@@ -79,7 +79,7 @@ def write_unit_file(path: Path, text: str) -> None:
 def remains_of(path: Path) -> list[Path]:
     """What a process that was killed while it wrote this unit file has left, see write_atomic()."""
     found = []
-    # Not .NAME.swp: an editor's file is somebody's work.
+    # Not .NAME.swp: an editor's file has unsaved work of a person.
     for one in path.parent.glob(f".{path.name}.{_RANDOM}"):
         with contextlib.suppress(FileNotFoundError):  # it has just got its name
             status = one.lstat()

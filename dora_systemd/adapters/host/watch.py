@@ -59,10 +59,10 @@ def identity(path: str) -> Identity | None:
 
 
 class Since(NamedTuple):
-    """The start of a run of the dataflow, which the first look at its files compares with.
+    """The start of a run of the dataflow, with which the first check of the files compares.
 
     at_ns: CLOCK_MONOTONIC, before the run reads any file. known: returns the versions of files that
-    the run was started from; the first look calls it, in a thread.
+    the run was started from; the first check calls it, in a thread.
     """
 
     at_ns: int
@@ -127,7 +127,7 @@ class Seen:
         self._gone: set[str] = set()
 
     def first(self, since: Since | None) -> frozenset[str]:
-        """Note how all files are now. Return those that have changed since the run began.
+        """Record the present state of all files. Return those changed since the run began.
 
         A file whose version at the start is known is compared with that version. Of any other file
         only the time of its last change is known.
@@ -138,23 +138,23 @@ class Seen:
     def _changed_since(self, since: Since) -> frozenset[str]:
         known = [one for one in since.known() if self._rules.has(one[0])]
         changed = {path for path, one in known if one != self._seen.get(path)}
-        # As an age: when somebody sets the clock, the files before the start must not look new.
+        # As an age: after the clock is set, files older than the start must not look new.
         now_ns, age_ns = time.time_ns(), time.monotonic_ns() - since.at_ns
         others = self._seen.keys() - {path for path, _ in known}
         late = {path for path in others if 0 <= now_ns - self._seen[path].changed_ns < age_ns}
         return frozenset(changed | late)
 
     def take(self, paths: Iterable[str]) -> frozenset[str]:
-        """Note how `paths` are now; the paths."""
+        """Record the present state of `paths`; return the paths."""
         files = frozenset(paths)
         self._note({path: identity(path) for path in files})
         return files
 
     def missed(self) -> frozenset[str]:
-        """Return the files that have changed since they were seen last, and note how they are now.
+        """Return the files that have changed since the last check, and record their state.
 
-        A file that was away and comes back as it was has not changed, unless it is one of
-        rules.files: settings do not apply while their file is away.
+        A file that was removed and restored has not changed, unless it is one of rules.files:
+        settings do not apply while their file is missing.
         """
         now = watched_files(self._rules)
         gone = self._seen.keys() - now.keys() - self._gone
@@ -265,7 +265,7 @@ async def _bursts(
             if not changes and before != await asyncio.to_thread(_inodes, directories):
                 return
     except FileNotFoundError:
-        # A directory has gone, perhaps for good, as that of a dataflow file apart from its project.
+        # A directory was removed, such as that of a dataflow file outside of its project.
         await asyncio.sleep(_GONE_SECONDS)
     except OSError as error:
         if error.errno == errno.ENOSPC or "limit" in str(error).lower():

@@ -1,6 +1,6 @@
 """Sends one record to the journal from a process that writes no others; loads less than `socket`.
 
-So requests are recorded: systemd notes no caller, and forgets what it has unloaded.
+Requests are recorded so: systemd records no caller, and forgets a unit that it has unloaded.
 
 journald adds the user of the process, see _UID in systemd.journal-fields(7).
 """

@@ -121,10 +121,10 @@ class JournalReader:
     def _recorded(
         self, known: set[str], found: Iterable[str], matches: Callable[[str], list[str]]
     ) -> list[str]:
-        """`known`, and those of `found` that really have a record, sorted.
+        """Return `known`, and those of `found` that really have a record, sorted.
 
-        Anybody can write records that look like those of another dataflow. matches: those of a
-        real record.
+        Any user can write records that look like those of another dataflow. matches: the fields of
+        a real record.
         """
         doubtful = islice((one for one in found if one not in known), _MOST_FORGED)
         return sorted(known.union(one for one in doubtful if any(self.newest(matches(one), 1))))
@@ -292,9 +292,9 @@ def place_since(start_us: int, root: Path | None = None) -> Place:
 
 
 def _newest(root: Path, top: str) -> float:
-    """When the newest system journal file there was written; without one, before all times.
+    """Return when the newest system journal file was written; without a file, -inf.
 
-    A file that cannot be looked at is believed to be in use.
+    A file that cannot be checked counts as in use.
     """
     return max(map(_written_us, _system_files(root / top)), default=-inf)
 
@@ -327,11 +327,11 @@ def check_readable(scope: Scope, root: Path | None = None) -> None:
 
 
 def later_failures(events: Sequence[LastEvent]) -> dict[str, int]:
-    """By UUID, when the unit of a dataflow has failed after its event, CLOCK_REALTIME µs.
+    """Find when units have failed after the last event of their dataflow: µs by UUID.
 
-    From systemd's own records: our code may not have run any more to record a failure. Only the
-    system's manager records whose failure it is, see LogExtraFields= in systemd.exec(5). Raises
-    DoraSystemdError.
+    Times are CLOCK_REALTIME. The records are systemd's own, because our code may have been killed
+    before it could record a failure. Only the system's manager adds the dataflow to such a record,
+    see LogExtraFields= in systemd.exec(5). Raises DoraSystemdError.
     """
     known = {event.uuid: event for event in events}
     found: dict[str, int] = {}
@@ -343,7 +343,7 @@ def later_failures(events: Sequence[LastEvent]) -> dict[str, int]:
 
 
 def _is_after(record: Mapping[str, Any], event: LastEvent) -> bool:
-    """By the order in the journal: the clock may have been set back in between."""
+    """Compare by the order in the journal, because the clock may have been set back."""
     source, number = _place(str(record.get("__CURSOR", "")))
     own_source, own_number = _place(event.cursor)
     if source and source == own_source:
@@ -352,7 +352,7 @@ def _is_after(record: Mapping[str, Any], event: LastEvent) -> bool:
 
 
 def _place(cursor: str) -> tuple[str, int]:
-    """Of a record, see "Cursor" in the Journal Export Formats: by whom it is counted, and its
-    number."""
+    """Parse the source and the sequence number of a record, see "Cursor" in the Journal Export
+    Formats."""
     fields = dict(part.partition("=")[::2] for part in cursor.split(";"))
     return fields.get("s", ""), int(fields.get("i", "0"), 16)

@@ -2,13 +2,14 @@
 
 systemd's file descriptor store keeps what is still in the pipe, and that is not enough: a flood, a
 prompt without a newline and a line longer than the pipe all lost lines when the runner was killed.
-To copy with tee(2), and read once journald has the line, saves only the flood: a prompt keeps the
-pipe readable, so the runner would spin, and a line longer than the pipe would never be complete.
+Copying with tee(2), and reading once journald has the line, would save only the flood: a prompt
+keeps the pipe readable, so the runner would spin, and a line longer than the pipe would never be
+complete.
 
 The file is in the RuntimeDirectory, which is in memory, and outlives a runner that is killed: the
 process of ExecStopPost= sends its content to journald. splice(2) moves the bytes from the pipe to
-the file in one system call, so they are always in one of the two. A kill after an entry was sent,
-and before that was noted, sends the entry twice.
+the file in one system call, so they are always in one of the two. A kill between sending an entry
+and recording that sends the entry twice.
 """
 
 import contextlib
@@ -67,14 +68,14 @@ class HeldLines:
                 self._give_up()
 
     def sent(self, lines: int) -> None:
-        """Note that journald has the first `lines` lines of the oldest batch."""
+        """Record that journald has the first `lines` lines of the oldest batch."""
         if self._done + lines != self._noted and not self._is_broken:
             self._noted = self._done + lines
             with contextlib.suppress(OSError):
                 os.pwrite(self._fd, _HEAD.pack(self._noted), 0)
 
     def sent_all(self, lines: int, rest: bytes | None) -> None:
-        """Note that journald has the oldest batch, which has `lines` lines.
+        """Record that journald has the oldest batch, which has `lines` lines.
 
         rest: the unterminated line at the end of this batch; None if other batches wait.
         """
@@ -127,7 +128,7 @@ class HeldLines:
 
 
 def held_path(pipe: Path) -> Path:
-    """The file that belongs to a FIFO."""
+    """Return the path of the file with the held bytes of a FIFO."""
     return pipe.with_name(pipe.name + SUFFIX)
 
 

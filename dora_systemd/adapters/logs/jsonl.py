@@ -68,14 +68,14 @@ class JsonlTail:
         self._timer = self._loop.call_later(0 if has_more else POLL_SECONDS, self.start)
 
     def drain(self) -> bool:
-        """Read what is there now, but not endlessly; whether there was anything."""
+        """Read what the file contains now, within a limit; return whether there was anything."""
         left = whole = self.backlog()
         while left > 0 and (size := self._read_chunk()):
             left -= size
         return left < whole
 
     def close(self) -> None:
-        """Read what is there, and stop."""
+        """Read what the file contains, and stop following it."""
         if self._timer is not None:
             self._timer.cancel()
         while self._read_chunk():
@@ -113,7 +113,7 @@ class JsonlTail:
                 os.lseek(self._fd, offset, os.SEEK_SET)
 
     def _note_place(self) -> None:
-        """Note inode and offset of what the journal has, and the path of the log file."""
+        """Write inode and offset of what the journal has, and the path, to the file `place`."""
         if self._place < 0 or self._fd < 0 or self._is_busy():
             return
         inode = os.fstat(self._fd).st_ino
@@ -187,7 +187,7 @@ class JsonlTail:
 
 
 def resume_tail(loop: asyncio.AbstractEventLoop, place: Path, put: Put) -> JsonlTail | None:
-    """Follow the file of a process that was killed, from the position that it noted.
+    """Follow the file of a killed process, from the position that the process recorded.
 
     None if that process had read nothing.
     """

@@ -21,7 +21,7 @@ from typing import Protocol
 # Lines cannot pile up because `pause` stops reading their pipes; records of the runner could.
 MAX_RECORDS = 20_000
 NOTE_EVERY = 16
-"""Entries between two notes: so many lines come twice if the runner is killed between them."""
+"""Entries between two calls of a Note: a kill of the runner repeats at most so many lines."""
 
 MakeEntries = Callable[[], list[bytes]]
 Note = Callable[[int], object]
@@ -48,7 +48,7 @@ class Journal(Protocol):
 
 
 def _ignore(left: int) -> None:
-    """The Note of items without one."""
+    """Do nothing, for items without a Note."""
 
 
 @dataclass

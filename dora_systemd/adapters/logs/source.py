@@ -97,7 +97,7 @@ class Source:
         return self.limiter.limit if self.limiter else None
 
     def take_suppressed(self) -> int:
-        """The number of suppressed lines that nobody has reported yet."""
+        """Return the number of suppressed lines that no event has reported yet, and reset it."""
         count = self.limiter.take_suppressed() if self.limiter else 0
         self.suppressed += count
         return count
@@ -146,7 +146,7 @@ class LineBatch:
         return list(map(self.encoder.entry, lines))
 
     def note(self, left: int) -> None:
-        """Note that journald has taken all but the last `left` entries."""
+        """Record that journald has taken all but the last `left` entries."""
         held = self.pipe.held
         if not left:
             self.source.written += self.passed

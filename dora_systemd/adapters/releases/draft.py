@@ -1,7 +1,7 @@
-"""A release that is being written; it gets its name by a rename, when all of it is on the disk.
+"""A release that is being written: it gets its name by a rename, when all data is on the disk.
 
 Everything is created below a directory that only its writer can change, so no path in it can lead
-elsewhere. Files that are like those of the last release become hard links to them.
+elsewhere. Files that are equal to those of the last release become hard links to them.
 """
 
 import ctypes
@@ -65,8 +65,8 @@ class Draft:
     def share(self, path: str, release_id: str, stored: Stored) -> bool:
         """Share a file with the same path in another release, where it was `stored`.
 
-        False if its content is another one by now, as on a bad disk: sharing it would copy the
-        damage from release to release, and no later deploy would heal it.
+        False if the content differs from `stored`, as on a bad disk: sharing would copy the damage
+        from release to release, and no later deploy would repair it.
         """
         file = self._store.tree(release_id) / path
         is_intact = stored_at(file) == stored
@@ -77,11 +77,11 @@ class Draft:
         return is_intact
 
     def adopt(self, path: str, file: Path) -> None:
-        """Share a file of another tree that nobody changes."""
+        """Share a file of another tree, which must be read-only, by a hard link."""
         self._place(path).hardlink_to(file)
 
     def copy(self, path: str, file: Path, is_executable: bool) -> Stored:
-        """Copy a file of another tree that nobody changes."""
+        """Copy a file of another tree, which must not change meanwhile."""
         with file.open("rb") as opened:
             chunks = iter(lambda: opened.read(_CHUNK), b"")
             return self.write(path, chunks, is_executable)
@@ -92,9 +92,9 @@ class Draft:
         return Stored(target=target)
 
     def publish(self, manifest: Manifest, group: int | None) -> None:
-        """Give the release its name, once all of it is on the disk.
+        """Write all data to the disk, and give the release its name.
 
-        group: who may enter it besides its owner; None: nobody.
+        group: may enter the release besides its owner; None: no other user may.
         """
         write_part(self._path, MANIFEST, format_manifest(manifest))
         self.lend(group)
@@ -103,7 +103,7 @@ class Draft:
         sync_directory(self._store.path)
 
     def lend(self, group: int | None) -> None:
-        """Let a group read what nobody changes any more; None: nobody but its owner."""
+        """Make the tree read-only, and let a group read it; None: only its owner."""
         for directory in self._made:
             directory.chmod(0o555)
         if group is not None:
@@ -111,7 +111,7 @@ class Draft:
             self._path.chmod(0o750)
 
     def discard(self) -> None:
-        """Remove it, unless it has its name."""
+        """Delete the draft, unless it has been published."""
         remove_tree(self._path)
 
     def free_bytes(self) -> int:
@@ -151,10 +151,10 @@ def _sync_file_system(path: Path) -> None:
 class BuildTree(Draft):
     """The tree in which a release is built: a copy of the project that the nodes' user may change.
 
-    The directory above it is root's alone, so nobody reaches the tree by a path but the unit of the
-    build, which sees it where the release will be. Its files are no hard links: the inodes of other
-    releases would become that user's. All of it is hostile once it is handed over. All methods
-    raise OSError.
+    The directory above the tree is root's alone, so only the unit of the build reaches the tree by
+    a path, the final path of the release. The files are no hard links: else inodes of other
+    releases would become that user's. After hand_over() nothing in the tree can be trusted. All
+    methods raise OSError.
     """
 
     def __init__(self, store: Store) -> None:
@@ -164,7 +164,7 @@ class BuildTree(Draft):
         )
 
     def hand_over(self, files: Mapping[str, Stored], owner: tuple[int, int] | None) -> None:
-        """Let the nodes' user write all of it.
+        """Let the nodes' user write the whole tree.
 
         files: that were copied. owner: uid and gid of that user, None for the caller.
         """

@@ -106,7 +106,7 @@ class Store:
             return False
 
     def prove(self, release_id: str) -> None:
-        """Note that a release has passed its trial. Raises OSError."""
+        """Record that a release has passed its trial. Raises OSError."""
         write_part(self.release(release_id), _PROVED, "")
 
     def doubt(self, release_id: str) -> None:
@@ -234,7 +234,7 @@ def make_directories(path: Path) -> None:
     for one in (*reversed(path.parents), path):
         if not one.exists():
             with contextlib.suppress(FileExistsError):
-                one.mkdir(0o755)  # also with a umask of 0: nobody else may put anything there
+                one.mkdir(0o755)  # also with a umask of 0: no other user may create files in it
                 one.chmod(0o755)
 
 
@@ -255,7 +255,7 @@ def remove_tree(path: Path) -> None:
         with contextlib.suppress(OSError), spawn(command, None, stderr=nowhere) as child:
             try:
                 child.wait(_REMOVE_SECONDS)
-            except subprocess.TimeoutExpired:  # somebody makes more of it meanwhile
+            except subprocess.TimeoutExpired:  # something creates files in it meanwhile
                 child.kill()
 
 

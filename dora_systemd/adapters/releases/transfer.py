@@ -1,6 +1,6 @@
 """A project on its way to other hosts: the copy that all of them get, and what one receives.
 
-Hosts get it one after the other, and all get the same bytes.
+Hosts get the copy one after the other, and all get the same bytes.
 """
 
 import contextlib
@@ -19,12 +19,12 @@ from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.errors import DoraSystemdError
 
 _DIRECTORY = "/var/tmp"
-"""Unlike /tmp, it is on a disk."""
+"""A directory that unlike /tmp is on a disk."""
 _NAME = ".sent"
 """No dataflow has such a name."""
 _YOUNG_SECONDS = 60.0
 _RACES = 20
-"""Of others that remove the shared directory just then; each of them has ended then."""
+"""Attempts: another process that has ended may remove the shared directory at the same time."""
 _CHUNK = 256 * 1024
 
 
@@ -117,7 +117,7 @@ class Stream:
             yield data
 
     def wait_for_end(self) -> None:
-        """Return when whoever sends has ended."""
+        """Wait until the sending process has ended."""
         with contextlib.suppress(OSError):
             while os.read(self._fd, _CHUNK):
                 pass

@@ -1,13 +1,13 @@
 """Requests to the runner over its socket: one request, one answer, each a line of JSON.
 
 listener.py is the other side. Only root and the user of the dataflow can access the directory of
-the socket, see unix(7). To root that user may be hostile, and can put anything there. So
-trust.sockets checks the owner, an answer has a timeout, a maximum size and a schema, and its texts
-are shown without control characters.
+the socket, see unix(7). root must not trust that user, who can put anything there. So trust.sockets
+checks the owner, an answer has a timeout, a maximum size and a schema, and its texts are shown
+without control characters.
 
-The answer to {"verb": "relay"} has the coordinator's token, and then the connection is one to the
-coordinator. So it reaches the right dataflow whatever its network is, and whoever else listens on
-ports of this machine.
+The answer to {"verb": "relay"} has the coordinator's token. After that the connection passes bytes
+to and from the coordinator: of the right dataflow, whatever network the dataflow has, and whatever
+else listens on ports of this machine.
 """
 
 import contextlib

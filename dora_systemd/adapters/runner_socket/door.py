@@ -15,7 +15,7 @@ from threading import Thread
 from typing import NamedTuple
 
 _SECONDS = 0.5
-"""For a request: only the user of the nodes and root can connect."""
+"""Timeout of a request: only the user of the nodes and root can connect."""
 _CHUNK = 1 << 16
 Greet = Callable[[bytes], tuple[bytes, bytes]]
 """Returns the answer to a line, b"" for nothing yet, and what replaces the line from then on."""
@@ -68,7 +68,7 @@ class Door:
         return self._listener, self._kept
 
     def close(self) -> None:
-        """End all that has begun: nobody takes it over."""
+        """Close the socket and all connections, if no event loop takes them over."""
         listener, kept = self.hand_over()
         for one in (listener, *(one.connection for one in kept)):
             one.close()

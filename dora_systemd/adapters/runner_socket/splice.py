@@ -58,7 +58,7 @@ async def taken_over(connection: socket.socket, said: bytes, limit: int) -> Ends
 async def splice(one: Ends, other: Ends) -> None:
     """Pass bytes between the two until one of them ends; then close both.
 
-    Holds at most a chunk and a buffer: an end that does not read makes the other one wait.
+    Holds at most a chunk and a buffer: if one side does not read, the other has to wait.
     """
     ways = ((one.reader, other.writer), (other.reader, one.writer))
     tasks = [asyncio.ensure_future(_pass(*way)) for way in ways]
