@@ -1,8 +1,9 @@
 """Variables in values of `env:`, such as ${HOME}, which the dora command replaces in its own way.
 
-The dora command replaces them when it reads the file. Here dora reads the descriptor in the unit,
-which has an environment of its own, so doractl gives it the caller's values, and the runner
-replaces them: dora's coordinator and its daemon would each do it once more (seen with dora 1.1).
+The dora command replaces variables when it reads the file. Of a supervised dataflow dora reads the
+descriptor in the unit, which has another environment. So doractl passes the caller's values to the
+runner, which replaces the variables and escapes the result: dora's coordinator and its daemon would
+each replace variables once more (seen with dora 1.1).
 """
 
 import re

@@ -203,7 +203,7 @@ _PIECE = re.compile(
     re.DOTALL,
 )
 _ESCAPE = re.compile(r'\\(?:\n|([$`"\\]))')
-"""In double quotes; before any other character a backslash is itself."""
+"""Escapes in double quotes; before any other character a backslash is literal."""
 
 
 def split_arguments(text: str) -> list[str]:

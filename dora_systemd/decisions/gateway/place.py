@@ -33,7 +33,7 @@ def token_path(scope: Scope) -> Path:
 
 
 def is_directory_of_user(directory: str) -> bool:
-    """Whether the RuntimeDirectory of a unit belongs to a user's manager."""
+    """Return whether the RuntimeDirectory of a unit is that of a user's manager."""
     return posixpath.normpath(directory).startswith("/run/user/")
 
 

@@ -7,7 +7,7 @@ ESSENTIAL = "essential "
 
 
 NO_END = "its end is not recorded: it was killed, or the machine went down"
-"""Nobody has recorded why."""
+"""The text for an end without any record of its cause."""
 
 
 class Cause(StrEnum):

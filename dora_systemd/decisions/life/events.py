@@ -14,7 +14,7 @@ from dora_systemd.decisions.resources.oom import Oom
 class Event:
     """Base of all events.
 
-    An event with nothing else inherits all of it, and needs no dataclass of its own.
+    An event without fields of its own inherits from Event, and needs no dataclass decorator.
     """
 
     at_us: int  # CLOCK_REALTIME µs at which the runner learned of it
@@ -121,7 +121,7 @@ class NodeSilent(Event):
 
 @dataclass(frozen=True)
 class NodeSpeaks(Event):
-    """An output that was missing has come."""
+    """A missing output has arrived."""
 
     node: str
     output: str

@@ -44,7 +44,7 @@ def because(cell: Cell, cause: Cause, nodes: Iterable[str] = ()) -> Cell:
 
 
 def broken(cell: Cell, event: life.Failed) -> Next:
-    """An exception in the runner: end the cell now, whatever is left to do."""
+    """End the cell now because of an exception in the runner."""
     cell = replace(cell, reload=False)
     if cell.failure:
         return fail(cell, cell.failure, cell.exit)  # the first failure counts
@@ -70,7 +70,7 @@ def child_exited(cell: Cell, event: life.ChildExited) -> Next:
 
 
 def connection_lost(cell: Cell, event: life.ConnectionLost) -> Next:
-    """A lost connection means the same as an exited child."""
+    """Handle a lost connection to the coordinator like the exit of the coordinator."""
     return _lose(cell, event.child, event.reason, Exit())
 
 

@@ -250,12 +250,12 @@ def result(cell: Cell, event: life.ResultKnown) -> Next:
 
 
 def stop_while_closing(cell: Cell, event: life.StopAsked) -> Next:
-    """Stop while the result is pending: the run has ended, so only note the request."""
+    """Record a stop request while the result is pending; the run itself has ended."""
     return replace(cell, stop_by=event.by), ()
 
 
 def end(cell: Cell, event: life.Event) -> Next:
-    """Nothing runs any more: record the end and exit."""
+    """Record the end and exit, because nothing runs any more."""
     if cell.stop_by:
         cell = replace(cell, failure="", exit=_exit_of_stop(cell))
         return to(cell, State.ENDED, Record("dataflow-stopped"), Do.EXIT)
@@ -296,7 +296,7 @@ def daemon_left(cell: Cell, event: life.ChildExited) -> Next:
 
 
 def node_exited(cell: Cell, event: life.NodeExited) -> Next:
-    """A node exited: end the dataflow if it is essential and has failed for good."""
+    """Record the exit of a node; end the dataflow if an essential node will not restart."""
     after, actions = node_event(cell, event)
     before = cell.nodes.get(event.node)
     if before is None or not event.is_essential or _is_replaced(cell, before):
@@ -317,7 +317,7 @@ def node_reloading(cell: Cell, event: life.Event) -> Next:
 
 
 def _is_replaced(cell: Cell, node: NodeStatus) -> bool:
-    """Whether this is the first process after a reload: the reloader goes back if it fails.
+    """Whether this is the first process after a reload, whose failure the reloader undoes.
 
     While the dataflow runs, only such a process has never been ready and is no restart of dora's.
     With a notice the reload is over, because the process was too slow. A requested restart of a
@@ -327,7 +327,7 @@ def _is_replaced(cell: Cell, node: NodeStatus) -> bool:
 
 
 def _is_lost(cell: Cell, ident: str) -> bool:
-    """Whether a node has failed for good.
+    """Whether a node has failed and will not start again.
 
     With the policy HELD a failed node waits for a reload. With LATCHED the end is not final yet: a
     device that the node needs may be gone, and if not, its launcher exits in its place.

@@ -1,4 +1,4 @@
-"""The handlers of what is different if a dataflow has several machines, see handlers.py.
+"""Handlers of events that only a dataflow with several machines has, see handlers.py.
 
 A lost machine is a lost run: dora cannot continue without one of its daemons, and a Stop then takes
 half a minute. So each machine ends its own nodes. With a restart policy the head waits for the
@@ -50,26 +50,26 @@ def awaited(cell: Cell, event: life.MachinesAwaited) -> Next:
 
 
 def gathered(cell: Cell, event: life.Gathered) -> Next:
-    """All machines are there: send the descriptor."""
+    """Send the descriptor, because all machines have joined."""
     return handle.joined(replace(cell, awaited=""), life.DaemonConnected(event.at_us))
 
 
 def found(cell: Cell, event: life.RunStarted) -> Next:
-    """A member has found the run that the head has started: subscribe to its events."""
+    """Subscribe to the events of the head's run, which this member has found."""
     cell = replace(cell, run=event.run, awaited="")
     return to(cell, State.STARTING, Do.SUBSCRIBE, after=ENGINE_TIMEOUT)
 
 
 def machine_joined(cell: Cell, event: life.MachineJoined) -> Next:
-    """A member can take nodes."""
+    """Record that a member has joined, and can run nodes."""
     name = "machine-back" if event.machine in cell.lost else "machine-joined"
     return cell, (Record(name, "", {"machine": event.machine}),)
 
 
 def machine_away(cell: Cell, event: life.MachineLost) -> Next:
-    """A member that had joined is gone, and nothing runs yet: wait for it.
+    """Wait for a member that had joined and is lost, before the run has started.
 
-    If somebody has stopped it there: its link would only start it again.
+    A member that was stopped on its machine fails the start: waiting would only restart it.
     """
     if event.by:
         cell = _stopped_there(cell, event)
@@ -80,7 +80,7 @@ def machine_away(cell: Cell, event: life.MachineLost) -> Next:
 
 
 def take_other_ports(cell: Cell, event: life.ReloadAsked) -> Next:
-    """Begin again: a machine has no room for the ports of this run."""
+    """End this run for the next one with other ports, because a machine has used ports of it."""
     return handle.leave_now(replace(cell, reload=True), event)
 
 
@@ -89,7 +89,7 @@ def _lost(machine: str, reason: str) -> Record:
 
 
 def machine_lost(cell: Cell, event: life.MachineLost) -> Next:
-    """A member is gone, and with it the run: end the nodes that are here."""
+    """End the nodes of this machine, because the run is lost with the member."""
     if event.by:
         cell = _stopped_there(cell, event)
     elif cell.waits_for_lost and not event.is_failure:
@@ -117,7 +117,7 @@ def machine_lost_stopping(cell: Cell, event: life.MachineLost) -> Next:
 
 
 def _end_nodes(cell: Cell, event: life.Event, *actions: Action) -> Next:
-    """End the nodes of this machine without dora; those of others end by themselves."""
+    """End the nodes of this machine without dora; other machines end their own nodes."""
     cell = replace(cell, nodes=_without_others(cell, event.at_us))
     return to(cell, State.STOPPING, *actions, Do.END_NODES, after=stop_timeout(cell.grace))
 

@@ -53,7 +53,7 @@ def all_ready(nodes: NodeTable, at_us: int) -> NodeTable:
 def update(
     nodes: NodeTable, event: life.Event, *, is_stopping: bool, is_open: bool
 ) -> tuple[NodeTable, tuple[Record, ...]]:
-    """The table after an event, and the records for the journal.
+    """Return the table after an event, and the records for the journal.
 
     is_open: whether dora's start barrier is open; then a ready node runs, even if it is alone.
     Each restart that the table counts is recorded, so `list` and `why` have the same number.
@@ -140,12 +140,12 @@ def _asked(nodes: NodeTable, event: life.NodeAsked) -> Change:
     old = nodes[event.node]
     record = Record("node-asked", event.node, {"asked": event.what, "by": event.by})
     if event.what == STOP:
-        # What was wrong with it is over, and how it ends is no failure.
+        # Earlier faults of the node are over, and its end is no failure.
         new = NodeStatus("stopped", old.pid, old.restarts, event.at_us)._replace(
             **{key: getattr(old, key) for key in _KEPT}, is_held=old.state == "waiting"
         )
     elif old.state == "waiting":
-        # It waits on: the next process is there already, and dora counts from zero since then.
+        # The node keeps waiting: its next process exists, and dora counts restarts from zero again.
         return {**nodes, event.node: old._replace(restarts=0)}, record
     else:
         state = "starting" if is_stopped(old) else "reloading"
@@ -216,7 +216,7 @@ def _hung(nodes: NodeTable, event: life.NodeHung) -> Change:
 
 
 def _heard(nodes: NodeTable, event: life.NodeSilent | life.NodeSpeaks) -> Change:
-    """An owed output of a node is missing, or has come."""
+    """Record that an owed output of a node is missing, or has arrived."""
     if event.node not in nodes:
         return nodes, None
     changed = nodes[event.node]._replace(silent=event.silent)
@@ -303,7 +303,7 @@ def _exited_as_told(nodes: NodeTable, event: life.NodeExited, old: NodeStatus) -
     """Record an end that was requested or is part of a reload: no exit status is a crash then."""
     asked = {"asked": old.asked} if old.asked else {}
     record = Record("node-exited", event.node, {**event.exit.details(), **asked})
-    if old.is_held:  # its launcher, which has no end of its own
+    if old.is_held:  # the exit of the launcher, which is no end of the node
         return {**nodes, event.node: old._replace(pid=0, is_held=False)}, None
     if is_stopped(old):
         return {**nodes, event.node: old._replace(pid=0, exit=event.exit)}, record
@@ -338,7 +338,7 @@ def _state_after(event: life.NodeExited, is_stopping: bool) -> str:
 
 
 def spent(nodes: NodeTable) -> dict[str, str]:
-    """By node that has failed for good because its restarts are used up, how it ended last."""
+    """Return the last end of each node that has used up its restarts, by node."""
     return {
         ident: f"{str(node.exit) or 'ended'} after {_restarts(node.restarts)}"
         for ident, node in nodes.items()

@@ -109,4 +109,4 @@ class Cell:
     lost: frozenset[str] = frozenset()  # machines that had joined, and were lost
     # whether the loss of a machine leads to another run in this process
     waits_for_lost: bool = False
-    early: tuple[str, ...] = ()  # the nodes that have ended for good before they had called dora
+    early: tuple[str, ...] = ()  # nodes that ended before they called dora, and will not restart

@@ -47,7 +47,7 @@ class LineSplitter:
 
     def feed(self, data: bytes) -> list[bytes]:
         """The lines that `data` completes."""
-        # A long line comes in many chunks: do not look through what is there for each of them.
+        # A long line arrives in many chunks: do not search the whole buffer after each chunk.
         is_short = len(self.rest) + len(data) <= self.limit
         if is_short and not _ENDS.search(data) and self.rest[-1:] != b"\r":
             self.rest += data

@@ -5,7 +5,7 @@ from collections.abc import Collection
 
 _TIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d+)?")
 _EXIT_OF_A_NODE = b"node_failure: dora_daemon::"
-"""In a line of dora's daemon about an end, which node-crashed, -ended or -exited reports."""
+"""Part of a line of dora's daemon about an end that node-crashed, -ended or -exited reports."""
 _END_OF_NODE = re.compile(r"node_failure: .*\bnode_id=(\S+)")
 
 
@@ -19,7 +19,7 @@ def is_same(one: bytes, other: bytes) -> bool:
 
 
 def repeated(text: str, times: int) -> str:
-    """What stands below a line that came so often in all: "" for a single one."""
+    """Format the text below a line that occurred `times` times; "" for once."""
     if times < 3:
         return text * (times - 1)
     return f"... the same line, {times} times in all"

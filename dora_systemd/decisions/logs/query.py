@@ -30,7 +30,7 @@ UNIT_FAILED = "d9b373ed55a64feb8242e02dbe79a49c"
 UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", UNIT_FAILED)
 
 ALL_LINES = "all"
-"""As a number of lines: no restriction, and no default of --follow."""
+"""The value of --lines for all lines, also with --follow."""
 _BOOT = re.compile(r"all|(?:[0-9a-f]{32})?(?:[+-]?[0-9]+)?")
 _DURATION = re.compile(r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:ms|s|min|m|h|d|w)")
 

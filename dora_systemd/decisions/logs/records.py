@@ -77,7 +77,7 @@ def log_payload(record: Record, uuid: str) -> dict[str, Any]:
 
 
 def level_of(record: Record) -> str:
-    """Its level: one of DORA_LEVELS, or "stdout" for a raw line of a node."""
+    """Return the level of a record: one of DORA_LEVELS, or "stdout" for a raw line of a node."""
     level = record_text(record, "DORA_LEVEL")
     if level in DORA_LEVELS:
         return level
@@ -97,7 +97,7 @@ def timestamp(record: Record) -> str:
 
 
 RAW = "stdout"
-"""The level that shows everything, also raw lines of nodes, which have no level of their own."""
+"""The level that shows everything, also raw lines of nodes, which have no level."""
 FILTER_LEVELS = (*DORA_LEVELS[1:], RAW)
 
 
@@ -133,9 +133,9 @@ _NOTICE = b"5"
 
 
 def lines_elsewhere(name: str, placed: Sequence[Placed], node: str, at_us: int) -> list[Record]:
-    """One record for a dataflow, or a node, with lines on other machines; else none.
+    """Return a record that names other machines with lines of a dataflow or a node; [] for none.
 
-    The gateway cannot read them: it has no keys, and its unit no network. node: "" for all.
+    The gateway cannot read those lines: it has no keys, and its unit no network. node: "" for all.
     at_us: now, CLOCK_REALTIME.
     """
     away = [one for one in placed if node in ("", one.node)]

@@ -189,7 +189,7 @@ class ShownLines:
         return shown_log(done)
 
     def flush(self) -> bytes:
-        """Nothing: it holds no line back."""
+        """Return b"", because no line is held back."""
         return b""
 
 

@@ -38,5 +38,5 @@ def _problem(text: str) -> str:
 
 
 def endpoint(address: str, port: int) -> str:
-    """As dora's --zenoh-listen takes it."""
+    """Format an address and a port for --zenoh-listen of dora."""
     return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"

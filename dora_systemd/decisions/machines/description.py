@@ -16,7 +16,7 @@ _LAST = 2**63 - 1
 
 @dataclass(frozen=True)
 class Facts:
-    """Of one account on one machine."""
+    """The description of one account on one machine."""
 
     # doractl, dora: versions, "" for none
     doractl: str

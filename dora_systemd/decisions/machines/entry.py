@@ -46,7 +46,7 @@ _UNIT: tuple[Setting[Any], ...] = (
     *(SANDBOX, WRITABLE),
 )
 OF_MACHINES = tuple(replace(one, per_node=False) for one in _UNIT)
-"""The settings of a unit that each machine may have of its own."""
+"""The settings of a unit that each machine may override."""
 
 
 class Machine(NamedTuple):
@@ -54,7 +54,7 @@ class Machine(NamedTuple):
 
     name: str
     host: Host
-    directory: str  # of the dataflow file there, absolute, or "" for the same as here
+    directory: str  # of the dataflow file on that machine, absolute; "" for the same as on the head
     labels: Mapping[str, str]
     settings: Sequence[tuple[Setting[Any], Any]]  # with their values
     is_own: bool  # it is declared for this dataflow, and not for all in a config.yml
@@ -165,7 +165,7 @@ def with_machine(text: str, name: str, host: str) -> str | None:
 
 
 def without_machine(text: str, name: str) -> str | None:
-    """The text without the machine; None if it does not stand there on lines of its own."""
+    """Return the text without the machine; None if the entry shares a line with other text."""
     pattern = rf"^(?P<in>[ ]+)(?P<q>[\"']?){re.escape(name)}(?P=q):.*\n?(?:(?P=in)[ ]+.*\n?)*"
     found = re.search(pattern, text, re.MULTILINE)
     heading = _KEY.search(text)
@@ -178,6 +178,6 @@ def without_machine(text: str, name: str) -> str | None:
 
 
 def _indented(after: str, entry: str) -> str:
-    """The entry as far to the right as those that are there."""
+    """Indent the entry like the existing entries."""
     first = re.match(r"([ ]+)\S", after)
     return f"{first[1] if first else '  '}{entry.lstrip()}"

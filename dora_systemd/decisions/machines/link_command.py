@@ -29,7 +29,7 @@ _OPTIONS = {
     "ServerAliveCountMax": "5",
     # Also for the first words of sshd, on a machine that is busy.
     "ConnectTimeout": "8",
-    # A connection of its own, whatever ssh_config(5) has.
+    # No shared connection, even if ssh_config(5) configures one.
     "ControlMaster": "no",
     "ControlPath": "none",
     "ClearAllForwardings": "no",

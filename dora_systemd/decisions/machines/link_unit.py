@@ -22,7 +22,7 @@ from dora_systemd.names import LINK_PREFIX, SLICE, UNIT_SUFFIX, unit_name
 from dora_systemd.values import SECOND
 
 _BETWEEN = ":"
-"""In no name of a dataflow or of a machine, so two links never have the same unit."""
+"""The separator occurs in no name of a dataflow or machine, so two links have different units."""
 _WATCHDOG = 25 * SECOND
 """µs without a word of a link: longer than all that it waits for, on a machine that is busy too."""
 _MOST = 255
@@ -133,7 +133,7 @@ def link_unit(
 
 
 def link_file(link: LinkUnit) -> str:
-    """Its unit file, for a head that is started at boot; the unit of the head wants it."""
+    """Format the unit file of a link, for a head that is started at boot and wants the link."""
     return HEADER + format_unit(link.properties)
 
 

@@ -48,13 +48,13 @@ class Member(NamedTuple):
     words: tuple[str, ...]
 
     def with_uuid(self, old: str, new: str) -> "Member":
-        """The same for a dataflow whose UUID turns out to be another one."""
+        """Return a copy whose arguments contain the UUID `new` instead of `old`."""
         told = {f"--uuid={old}": f"--uuid={new}"}
         return self._replace(words=tuple(told.get(word, word) for word in self.words))
 
 
 def on_head(options: RunnerOptions) -> RunnerOptions:
-    """The options of the head's runner: without what only the runners of members need."""
+    """Return the options of the head's runner, without those that only members need."""
     away = {one.node for one in options.placed}
     return options._replace(
         head="",
@@ -139,7 +139,7 @@ def _flags(setting: Setting[Any], value: Any) -> Iterator[str]:
 
 
 def _directory(machine: Machine, options: RunnerOptions) -> str:
-    """The working directory there: if it is below that of the dataflow file, it is so there."""
+    """Return the working directory on the machine: below the dataflow file's, if it is so here."""
     there, here = PurePath(options.working_directory), PurePath(options.dataflow).parent
     if machine.directory and there.is_relative_to(here):
         return str(PurePath(machine.directory, there.relative_to(here)))

@@ -38,7 +38,7 @@ COPY_HINT = "copy the directory of the dataflow to that machine"
 
 
 def format_other_file(path: str) -> str:
-    """Why a member refuses its part if its descriptor is not that of the head."""
+    """Format why a member refuses its part: its descriptor differs from that of the head."""
     return f"{path} is not the same file as on the head"
 
 
@@ -120,7 +120,7 @@ def _is_digest(path: str, digest: object) -> bool:
 
 
 def differing(here: Digests, there: Digests) -> list[str]:
-    """The files that both machines have, and that are not the same."""
+    """Return the files that both machines have, with different contents."""
     return sorted(path for path, one in there.items() if here.get(path, one) != one)
 
 

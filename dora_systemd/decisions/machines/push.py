@@ -22,8 +22,8 @@ _SSH = (
     *("-oServerAliveInterval=5", "-oServerAliveCountMax=3"),
     *("-oClearAllForwardings=yes", "-oRemoteCommand=none"),
 )
-# No owner and no group: all is that of the account there. No devices, and no --delete: what else is
-# in a directory that somebody has named by mistake stays.
+# No owner and no group: the account on the machine owns all files. No devices. No --delete: other
+# files stay, in case that the directory was named by mistake.
 _RSYNC = ("rsync", "--recursive", "--links", "--perms", "--times", "--mkpath", "--secluded-args")
 
 
@@ -47,7 +47,7 @@ def rsync_command(member: Member, dataflow: str) -> list[str]:
 
 
 def _bracketed(host: Host) -> str:
-    """rsync takes two colons for a daemon of its own, so an IPv6 address is in brackets."""
+    """Put an IPv6 address into brackets: rsync takes two colons for the name of its daemon."""
     user, at, name = host.destination.rpartition("@")
     return f"{user}{at}[{name}]" if ":" in name else host.destination
 

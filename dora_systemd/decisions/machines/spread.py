@@ -3,9 +3,9 @@
 dora has `deploy: {machine: NAME}` and `deploy: {labels: {KEY: VALUE}}`. A node without either runs
 on the head, as does one with the head's own hostname.
 
-With `link: direct` zenoh connects the machines without ssh, on addresses that somebody has chosen.
-zenoh of dora has no password and no encryption. So it listens on these addresses and no others, and
-the units exchange packets with them and with no others, see decisions/unit/properties.py.
+With `link: direct` zenoh connects the machines without ssh, on addresses in the settings. dora's
+zenoh has no password and no encryption. So zenoh listens only on these addresses, and the units
+exchange packets only with these addresses, see decisions/unit/properties.py.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -165,7 +165,7 @@ def _check_used(
 
 
 def _check_hosts(machines: Sequence[Machine], source: str) -> None:
-    """Two parts of a dataflow on one host would have the same unit."""
+    """Refuse two parts on one host, because they would have the same unit."""
     seen: dict[tuple[str, str], str] = {}
     for one in machines:
         key = one.host.destination, one.host.port

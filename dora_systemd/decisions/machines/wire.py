@@ -55,7 +55,7 @@ class Unreached:
 
     reason: str
     hint: str
-    tries: int  # after so many in a row a start for which somebody waits is of no use; 0 if none is
+    tries: int  # failed attempts in a row after which a start by hand gives up; 0: all give up
 
 
 @dataclass(frozen=True)
@@ -83,13 +83,13 @@ class Part:
     # doractl, dora: versions of the head
     doractl: str
     dora: str
-    again: int = 0  # 0 if somebody waits for this start; else what is missing may come later
+    again: int = 0  # 0 for a start by hand; else what is missing may appear later
     version: int = VERSION
 
 
 @dataclass(frozen=True)
 class Beat:
-    """Either side is there."""
+    """Either side still runs."""
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def _value(kind: type[Any], key: str, value: object) -> object:
         return _number(value)
     if not isinstance(value, str) or "\0" in value:
         raise ValueError(key)
-    value.encode()  # JSON can have half a character, and nobody could write it
+    value.encode()  # JSON can contain half of a surrogate pair, which has no encoding
     return value if key in _LONG else value[:MAX_TEXT]
 
 

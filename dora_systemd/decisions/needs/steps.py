@@ -1,4 +1,4 @@
-"""What to do with nodes whose needs are missing, or are there again. Pure."""
+"""Steps for nodes whose needs are missing or exist again. Pure."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
@@ -13,7 +13,7 @@ class Do(Enum):
     """What to do with a node."""
 
     HOLD = "wait"
-    """Its launcher waits already: only show it."""
+    """The launcher of the node waits already: only show the wait."""
     LOSE = "end it"
     """End its process; the next one waits."""
     LET_GO = "go on"

@@ -24,7 +24,7 @@ CLOCK_WAITERS = (CHRONY, TIMESYNCD)
 
 
 def required_units(needs: tuple[str, ...]) -> dict[str, str]:
-    """By need, the unit that has to run for as long as the dataflow does."""
+    """Return the unit that has to run for as long as the dataflow does, by need."""
     units = {one: one.removeprefix(UNIT) for one in needs if one.startswith(UNIT)}
     dataflows = (one for one in needs if one.startswith(DATAFLOW))
     return units | {one: unit_name(one.removeprefix(DATAFLOW)) for one in dataflows}
@@ -61,9 +61,9 @@ _ESCAPED = re.compile(rb"\\x([0-9a-f]{2})|-")
 
 
 def format_awaited(units: Iterable[str]) -> str:
-    """As "dataflow base, network"; "" without any. units: whose jobs the start waits for.
+    """Format "dataflow base, network"; "" without any. units: whose jobs the start waits for.
 
-    Units for which all services wait are named only if there is no other one.
+    Units for which all services wait are named only if there is no other unit.
     """
     known = sorted(units)
     words = list(dict.fromkeys(map(_need_word, own_units(known) or known)))
@@ -72,12 +72,12 @@ def format_awaited(units: Iterable[str]) -> str:
 
 
 def own_units(units: Iterable[str]) -> list[str]:
-    """Those of them for which not all services wait."""
+    """Return those of `units` for which not all services wait."""
     return [one for one in units if one not in _OF_ALL and not one.endswith(".slice")]
 
 
 def _need_word(unit: str) -> str:
-    """The need that a unit stands for, else the unit."""
+    """The need from which a unit was derived, else the unit."""
     if unit == NETWORK_UNIT:
         return NETWORK
     if unit in (CLOCK_UNIT, *CLOCK_WAITERS):
@@ -92,7 +92,7 @@ def _need_word(unit: str) -> str:
 
 
 def _unescaped(name: str) -> str:
-    """As systemd-escape(1) --unescape --path."""
+    """Unescape a path as systemd-escape(1) --unescape --path does."""
     parts = _ESCAPED.sub(lambda match: bytes.fromhex((match[1] or b"2f").decode()), name.encode())
     return f"/{parts.decode(errors='replace').lstrip('/')}"
 

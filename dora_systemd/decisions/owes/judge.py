@@ -1,10 +1,10 @@
 """Decides which nodes are silent. Pure: each look contains its time.
 
-A node is silent when no message of an owed output has come for `within`, or none for `first` after
-its start. Time counts only as far as all have run who could have noticed a message: at most `tick`
-for each look, and nothing while the probe does not note its beat. So none of these is a silence of
-a node: a suspended machine, a cell that a signal or the freezer has stopped, a clock that was set,
-a runner or a probe that gets no CPU time.
+A node is silent when no message of an owed output has arrived for `within`, or none for `first`
+after its start. Time counts only while both runner and probe have run: at most `tick` for each
+look, and nothing while the probe does not write its beat. So none of these is a silence of a node:
+a suspended machine, a cell that a signal or the freezer has stopped, a clock that was set, a runner
+or a probe that gets no CPU time.
 
 A silent node whose own inputs are silent is starved, see probe.py: its process is not at fault.
 """
@@ -23,7 +23,7 @@ _EARLY = SECOND // 5
 """µs by which a first message may precede dora's report that the process is ready: less than the
 delay before a restart, in which no process of the node sends messages."""
 BEATS = 2
-"""Ticks after which a probe that has not noted its beat counts as stopped."""
+"""Ticks after which a probe that has not written its beat counts as stopped."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Look:
     beat_us: int  # the last beat of the probe
     heard: Sequence[int]  # the last message of each slot of Feeds
     lives: Mapping[str, int]  # by node that runs, when its process became ready
-    probe: int = 0  # the number of the one that has noted the beat
+    probe: int = 0  # the number of the probe that has written the beat
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Ear:
     has_come: bool = False  # whether this process has sent one
     quiet: int = 0  # time that counts, without a message
     is_judged: bool = False  # this silence has been reported
-    is_silent: bool = False  # no message has come since a silence was reported
+    is_silent: bool = False  # no message has arrived since a silence was reported
     silent_us: int = 0  # when the silence was reported
     flows: tuple[Flow, ...] = ()  # the inputs of the node
     starved: str = ""  # the input, NODE/OUTPUT, that the silence comes from, or ""
@@ -119,9 +119,9 @@ def _unheard(ear: Ear) -> Ear:
 
 
 def _fed(feeds: Feeds, owed: Owed, ear: Ear, heard: Sequence[int], step: int) -> Ear:
-    """The ear after a look at the inputs of its node.
+    """Return the ear with the state of its node's inputs.
 
-    When a starved node gets its input again, the time to answer begins.
+    When a starved node receives input again, the time for its next output begins.
     """
     slots = feeds.by_node.get(owed.node, ())
     known = ear.flows or (Flow(),) * len(slots)

@@ -15,7 +15,7 @@ _CAPABILITY_NAMES = (
     *("lease", "audit_write", "audit_control", "setfcap", "mac_override", "mac_admin", "syslog"),
     *("wake_alarm", "block_suspend", "audit_read", "perfmon", "bpf", "checkpoint_restore"),
 )
-"""In the order of their numbers, see capabilities(7)."""
+"""The capabilities in the order of their numbers, see capabilities(7)."""
 
 _CAPABILITIES = {f"CAP_{name.upper()}": 1 << bit for bit, name in enumerate(_CAPABILITY_NAMES)}
 

@@ -60,7 +60,7 @@ def quote_word(text: str) -> str:
 
 
 def _unescaped(match: re.Match[str]) -> str:
-    """What an escape stands for; any other escaped character means itself, as in paths."""
+    """Replace an escape; any other escaped character is literal, as in paths."""
     letter, octal = match["letter"], match["octal"]
     if letter:
         return _LETTERS.get(letter, letter)

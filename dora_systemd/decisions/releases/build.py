@@ -20,7 +20,7 @@ _FAILED_NODE = re.compile(r"failed to build node `(?P<node>[^`\n]+)`")
 _UV_ERROR = re.compile(r"^(?:error: | +× )", re.MULTILINE)
 _UV_CAUSE = re.compile(r"\n +(?:cause:|Caused by:|[├╰]─▶) *")
 _UNATTENDED = {"PIP_NO_INPUT": "1", "GIT_TERMINAL_PROMPT": "0"}
-"""Nobody is there to answer."""
+"""Variables that prevent questions, which nobody could answer in a unit."""
 _HOMELESS = {
     "UV_NO_CACHE": "1",
     "UV_PYTHON_DOWNLOADS": "never",
@@ -31,7 +31,7 @@ _ALWAYS = {
     # Bytecode is valid by its source's content, for the files get new times. Python, pip and uv
     # have this mode by this variable alone.
     "SOURCE_DATE_EPOCH": "315532800",
-    # _COMPILE does that when all is there.
+    # _COMPILE does that when all packages are installed.
     "UV_COMPILE_BYTECODE": "0",
     "UV_LINK_MODE": "copy",
     # The sandbox makes homes read-only, and a Python in one of them is no part of the release.
@@ -57,7 +57,7 @@ class BuildTask:
     release: str  # its id
     directory: str  # where the commands run, in their order
     commands: tuple[tuple[str, ...], ...]
-    is_shown: bool = False  # whether somebody reads its standard output, and not the journal
+    is_shown: bool = False  # whether doractl shows standard output, and not the journal
 
 
 def format_task(task: BuildTask) -> str:
@@ -102,9 +102,9 @@ def has_builds(value: object) -> bool:
 
 
 def is_moving(dataflow: Dataflow) -> bool:
-    """Whether the same files may build another program: of the newest commit of a repository.
+    """Return whether equal files may build another program, from a repository's newest commit.
 
-    A module is not looked into, and may name a repository.
+    True for a module, too, which is not read and may name a repository.
     """
     return any(
         node.kind is NodeKind.MODULE or (node.git and not {"rev", "tag"} & node.raw.keys())
@@ -149,10 +149,10 @@ def project_commands(
 def project_environment(
     given: Mapping[str, str], venv: str | None, more: Sequence[str], has_home: bool
 ) -> dict[str, str]:
-    """The variables of a build where the project is, from those of the nodes.
+    """Return the variables of a build in the project's directory, from those of the nodes.
 
-    venv: that of the project, which uv may make, or None. more: directories for the end of PATH.
-    has_home: whether the account has a home directory that it can write, for caches.
+    venv: of the project, which uv may create, or None. more: directories for the end of PATH.
+    has_home: whether the account has a writable home directory, for caches.
     """
     always = {**_UNATTENDED, **({} if has_home else _HOMELESS)}
     path = given.get("PATH", "")
@@ -166,10 +166,10 @@ def project_environment(
 def build_environment(
     given: Mapping[str, str], venv: str | None, former_venv: str | None, more: str = ""
 ) -> dict[str, str]:
-    """The variables of a build, from those of the nodes, which have precedence.
+    """Return the variables of a build, from those of the nodes, which have precedence.
 
-    venv: which the build may create, None for one that is given. former_venv: whose programs come
-    first on PATH otherwise. more: a directory of programs that come after those of `venv`, or "".
+    venv: which the build may create, None for a given one. former_venv: its programs come first on
+    PATH otherwise. more: a directory of programs that come after those of `venv`, or "".
     """
     if venv is None:
         return {**_ALWAYS, **given}

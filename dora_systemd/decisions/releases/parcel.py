@@ -42,7 +42,7 @@ class Parcel:
     directory: str | None  # the working directory, relative to `source`; None for the file's
     revision: str  # of git, or ""
     files: Mapping[str, Stored] = field(default_factory=dict)
-    owner: str = ""  # the user whose files they are, "" for those of root and of who sends them
+    owner: str = ""  # the user who owns the files, "" if root or the sender does
 
     @property
     def contents(self) -> list[Stored]:
@@ -130,7 +130,7 @@ def missing(parcel: Parcel, there: Mapping[str, Stored]) -> list[int]:
 
 
 def total(contents: Sequence[Stored]) -> int:
-    """Their bytes."""
+    """Return the bytes of all contents."""
     return sum(one.size for one in contents)
 
 

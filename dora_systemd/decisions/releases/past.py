@@ -1,6 +1,6 @@
-"""The history of what ran of a dataflow, a line for each change, and what follows from it. Pure.
+"""The history of the releases that ran of a dataflow, a line for each change. Pure.
 
-From the history follow which releases are kept, and which one a rollback takes.
+The history determines which releases are kept, and which release a rollback takes.
 """
 
 import json
@@ -21,7 +21,7 @@ _MOST_BYTES = 800
 
 
 class Switch(NamedTuple):
-    """One change of what runs."""
+    """One change of the release that runs."""
 
     at_us: int  # CLOCK_REALTIME µs
     former: str  # the release that ended, "" if none ran
@@ -54,7 +54,7 @@ def format_switch(one: Switch) -> bytes:
 
 
 def parse_history(data: bytes) -> list[Switch]:
-    """The changes in the file, oldest first. A line that is cut off or damaged is left out."""
+    """Parse the changes in the file, oldest first. A partial or damaged line is left out."""
     whole = data[: data.rfind(b"\n") + 1]
     return [found for line in whole.splitlines() if (found := _parse(line))]
 
@@ -79,10 +79,10 @@ def how_of(history: Sequence[Switch], release: str, known: Collection[str] = ())
 
 
 def runs(history: Sequence[Switch], known: Iterable[str] = ()) -> list[str]:
-    """The releases that ran one after the other, the present one last.
+    """Return the releases that ran one after the other, the present one last.
 
-    Those that a rollback has gone back over are left out. known: releases that have passed a trial;
-    those older than all that the history names ran before it.
+    Releases that a rollback has undone are left out. known: releases that have passed a trial;
+    those older than all releases of the history ran before it begins.
     """
     named = {id_ for one in history for id_ in (one.former, one.release) if id_}
     found = sorted(one for one in set(known) if not named or one < min(named))
@@ -212,10 +212,10 @@ def surplus(
     used: Collection[str] = (),
     history: Sequence[Switch] = (),
 ) -> list[str]:
-    """The releases that go, oldest first: all but `keep`.
+    """Return the releases to remove, oldest first: all but `keep`.
 
-    Those that have not run well go before those that have, and older ones before newer ones. The
-    current one, the one before it and those of `used` stay in any case.
+    Releases without a passed trial are removed before those with one, older before newer. The
+    current release, the release before it and those of `used` stay in any case.
     """
     bad = marks(history)
     ids = sorted((one.id for one in releases), reverse=True)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 
 PROGRAMS = ("dora", "python")
-"""Those that the check knows."""
+"""The programs whose versions are checked."""
 _MARK = "versions:"
 _VERSION = re.compile(r"[0-9][0-9A-Za-z.+~-]{0,31}")
 
@@ -19,7 +19,7 @@ def format_versions(versions: Mapping[str, str]) -> str:
 
 
 def parse_versions(text: str) -> dict[str, str]:
-    """The versions in what a check has printed; what is none is left out."""
+    """Parse the versions that a check has printed; other text is left out."""
     line = next((line for line in text.splitlines() if line.startswith(_MARK)), "")
     pairs = (word.partition("=")[::2] for word in line.removeprefix(_MARK).split())
     return {name: one for name, one in pairs if name in PROGRAMS and _VERSION.fullmatch(one)}

@@ -37,8 +37,8 @@ class Step(NamedTuple):
 class Pace:
     """Chooses the steps that are shown: what is new at once, what only grows now and then.
 
-    interval: seconds between two steps of the latter kind. silence: after so many one that is the
-    same is shown, too, as a sign of life.
+    interval: seconds between two steps of the latter kind. silence: seconds after which an
+    unchanged step is shown, too, as a sign of life.
     """
 
     def __init__(self, interval: float, silence: float = inf) -> None:
@@ -60,25 +60,25 @@ class Pace:
 
 
 def waiting(text: str) -> Step:
-    """A lock inhibits it. text: which one."""
+    """Return the step of a change that a lock inhibits. text: which lock."""
     return Step(WAIT, text)
 
 
 def copying(done: int, total: int) -> Step:
-    """Bytes of the project that are in the release."""
+    """Return the step of copying. done: bytes of the project that are in the release."""
     text = f"copying: {format_rounded_size(done)} of {format_rounded_size(total)}"
     return Step(COPY, text, amount=(done, total))
 
 
 def copied(files: int, total: int, new: int) -> Step:
-    """The copy is complete. new: bytes that no other release has."""
+    """Return the step of a complete copy. new: bytes that no other release has."""
     count = f"{files} file{'' if files == 1 else 's'}"
     text = f"copied: {count}, {format_rounded_size(total)}, {format_rounded_size(new)} of it new"
     return Step(COPY, text, amount=(total, total), is_last=True)
 
 
 def checking() -> Step:
-    """The copy is checked as for a start."""
+    """Return the step that checks the copy as for a start."""
     return Step(CHECK, "checking")
 
 

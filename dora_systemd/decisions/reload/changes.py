@@ -21,7 +21,7 @@ class NodeSources:
     files: frozenset[str] = frozenset()
     text: str = ""  # its whole definition, which may contain names of configuration files
     rules: WatchRules | None = None  # its own `watch` patterns
-    fresh: frozenset[str] = frozenset()  # those of the files that it runs in their present version
+    fresh: frozenset[str] = frozenset()  # the files that the node runs in their present version
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def _take_long(word: str, rest: Iterator[str], valued: Set[str], parted: Parted)
 
 
 def _take_short(word: str, rest: Iterator[str], valued: Set[str], parted: Parted) -> None:
-    """One letter after the other: the first that has a value takes the rest of the word."""
+    """Parse combined letters: the first letter with a value takes the rest of the word."""
     for place, letter in enumerate(word[1:], 1):
         value = word[place + 1 :]
         if f"-{letter}" == SHORT:

@@ -13,7 +13,7 @@ from dora_systemd.errors import REACHED_AS, DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
 ALL = "all"
-"""As a host: all hosts of the hosts file."""
+"""The value of -H for all hosts of the hosts file."""
 
 _ADDRESS = r"[0-9A-Fa-f.]*(?::[0-9A-Fa-f.]*){2,}(?:%[A-Za-z0-9_.-]+)?"
 # No host or user begins with a dash: ssh would take it for an option.
@@ -84,7 +84,7 @@ def _lines(text: str, path: str) -> Iterator[Host]:
 
 
 CONNECT_SECONDS = 5
-"""For the connection, until ssh knows that a server speaks there."""
+"""Timeout of the connection, until a server answers."""
 ALIVE_SECONDS, ALIVE_COUNT = 5, 3
 """A connection without an answer for this long, so many times, is lost."""
 
@@ -95,7 +95,7 @@ _OPTIONS = {
     "ConnectTimeout": CONNECT_SECONDS,
     "ServerAliveInterval": ALIVE_SECONDS,
     "ServerAliveCountMax": ALIVE_COUNT,
-    # No banner, no "Connection closed.": what is left are ssh's errors.
+    # No banner, no "Connection closed.": only ssh's errors.
     "LogLevel": "ERROR",
     # For a host that is configured for something else as well.
     "ClearAllForwardings": "yes",
@@ -104,7 +104,7 @@ _OPTIONS = {
 _FIND = "command -v doractl >/dev/null 2>&1 || exit 127\n"
 # A login shell may print before: what counts begins after the mark, on both streams.
 _BEGIN = f'echo "$1"\necho "$1" >&2\nshift\n{_FIND}'
-# Standard input is the life line: it ends with this doractl, and so does the one over there.
+# Standard input ends with this doractl, and then the doractl on the host ends, too.
 _FOLLOW = """exec 3<&0
 doractl "$@" </dev/null 3<&- &
 child=$!
@@ -119,10 +119,10 @@ exit "$status"
 
 
 class Way(Enum):
-    """How doractl runs over there: the script of sh(1).
+    """How doractl runs on a host: the script of sh(1).
 
-    TERMINAL: on a terminal of its own. ONCE: it ends by itself, without input. FED: it reads our
-    standard input. FOLLOWING: it ends with this command.
+    TERMINAL: on a terminal of its own. ONCE: until it ends by itself, without input. FED: reading
+    our standard input. FOLLOWING: until this command ends.
     """
 
     TERMINAL = f'{_FIND}exec doractl "$@"\n'

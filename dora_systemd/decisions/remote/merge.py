@@ -18,7 +18,7 @@ a second."""
 MOST_HELD = 2000
 """Records of one host that are held: more of them stay in its pipe."""
 MOST_BYTES = 16 << 20
-"""The same, in bytes."""
+"""Bytes of one host's records that are held."""
 
 
 class Held(NamedTuple):
@@ -92,7 +92,7 @@ class Merge:
 
 TIME = "__REALTIME_TIMESTAMP"
 _MOST_BYTES = 4 << 20
-"""Of one record that is not complete."""
+"""Maximum bytes of a record that is not complete."""
 _MOST_TIME = 253_370_764_800_000_000
 """The year 9999, in µs."""
 

@@ -14,7 +14,7 @@ UNCHANGED = "unchanged"
 INHIBITED, UNREACHABLE, LOST = "inhibited", "unreachable", "lost"
 FAILED, NOT_TRIED = "failed", "not tried"
 _RELEASE_WIDTH = 24
-"""Of an id with a revision of git."""
+"""The width of a release id with a revision of git."""
 _UNKNOWN = "-"
 
 

@@ -116,7 +116,7 @@ def failed_there(host: Host, complaint: str, status: int) -> DoraSystemdError:
 def ending_error(
     host: Host, status: int, is_in: bool, said: str, complaint: str
 ) -> DoraSystemdError | None:
-    """Why a conversation ended, None if doractl itself ended there.
+    """Return why a connection ended; None if doractl itself ended on the host.
 
     status: exit status of ssh. is_in: whether the mark came. `said`, complaint: the end of standard
     output and error; before the mark, those of ssh and of the login shell.

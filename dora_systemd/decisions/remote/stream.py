@@ -68,7 +68,7 @@ def with_host(value: dict[str, Any], host: str, key: str = "host") -> dict[str, 
 
 
 def objects_of(text: str, host: str) -> list[dict[str, Any]] | None:
-    """The object in a text, or those of a list, with their host; None if there are none."""
+    """Parse an object, or a list of objects, and add the host to each; None for other text."""
     value = read_json(text)
     if not _is_printable(value):
         return None

@@ -53,7 +53,7 @@ Report = tuple[str, str, Mapping[str, str]]
 """Event, node (WHOLE_CELL: the dataflow) and details."""
 
 Alarms = Mapping[tuple[str, str], Alarm]
-"""By node (WHOLE_CELL: the dataflow) and event."""
+"""Alarms by node (WHOLE_CELL: the dataflow) and event."""
 
 
 def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms, list[Report]]:
@@ -72,7 +72,7 @@ def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms
 
 
 def _judged(load: Load) -> list[tuple[str, bool, bool]]:
-    """For each limit: the event, whether it is bad, and whether it is well."""
+    """Judge a sample for each limit: the event, whether the sample is bad, whether it is good."""
     judged = []
     if load.limit is not None:
         is_bad = load.held >= FULL * load.limit or load.stalled >= STALLED

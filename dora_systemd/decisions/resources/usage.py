@@ -54,7 +54,7 @@ def usage_facts(use: Usage, cpu_percent: float | None, throttled: float | None) 
 
 
 def waits(before: Strain, now: Strain, window: int) -> dict[str, float]:
-    """By resource, the percentage of `window` µs in which some process waited for it."""
+    """Return the percentage of `window` µs in which some process waited, by resource."""
     if window <= 0:
         return {}
     return {

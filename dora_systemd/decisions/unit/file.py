@@ -124,9 +124,9 @@ def user_of(text: str) -> str:
 
 
 def says_the_same(text: str, other: str) -> bool:
-    """Whether two unit files start the same dataflow in the same way, by whatever target.
+    """Return whether two unit files start a dataflow in the same way, by any target.
 
-    Also False if one of them has lines that only its admin can have written.
+    False also if one of them has lines that doractl does not write.
     """
     first = _properties(text)
     return first is not None and first == _properties(other)

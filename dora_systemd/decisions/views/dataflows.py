@@ -18,10 +18,10 @@ from dora_systemd.terminal_text import cut, one_line
 STARTING, WAITING, RUNNING, DEGRADED = "Starting", "Waiting", "Running", "Degraded"
 STOPPING, RESTARTING = "Stopping", "Restarting"
 FROZEN = "Frozen"
-"""Somebody has frozen the unit, as by `systemctl freeze`."""
+"""The status of a frozen unit, see `systemctl freeze`."""
 FINISHED, STOPPED, FAILED = "Finished", "Stopped", "Failed"
 UNREACHABLE = "Unreachable"
-"""In the place of a status: that of a host from which no answer came."""
+"""The status in the row of a host that did not answer."""
 UP_WORDS = frozenset({STARTING, WAITING, RUNNING, DEGRADED, STOPPING, RESTARTING, FROZEN})
 
 _BY_ACTIVE = {
@@ -38,7 +38,7 @@ _ALIVE = ("activating", "active", "reloading", "refreshing")
 _BY_STAGE = {"degraded": DEGRADED, "unmet": WAITING, "stopping": STOPPING}
 
 UNREADABLE = "?"
-"""For the nodes of a dataflow whose node table is not valid."""
+"""The count of nodes of a dataflow whose node table is not valid."""
 SHORTEST_PREFIX = 8
 
 
@@ -93,7 +93,7 @@ STATE_COLORS = {
         (STARTING, WAITING, DEGRADED, STOPPING, RESTARTING, FROZEN, SILENT, "Reloading"), "yellow"
     ),
 }
-"""By the word for a state, as in systemctl(1); others have none."""
+"""Colours by the text of a state, as in systemctl(1); other states have none."""
 
 
 def colored_state(text: str, word: str) -> str:
@@ -140,7 +140,7 @@ def _width(column: Sequence[str]) -> int:
 
 
 def _excess(columns: Sequence[Sequence[str]], width: int) -> int:
-    """By how much the table is wider than that."""
+    """Return by how many characters the table is wider than `width`."""
     return sum(map(_width, columns)) + 2 * (len(columns) - 1) - width
 
 

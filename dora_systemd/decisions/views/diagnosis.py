@@ -44,7 +44,7 @@ class Process:
 
     @property
     def is_in_cell(self) -> bool:
-        """Whether it belongs to a dataflow of ours, in any manager."""
+        """Whether the process is part of a supervised dataflow, in any manager."""
         return bool(_CELL.search(self.group))
 
     def __str__(self) -> str:

@@ -68,7 +68,7 @@ class NodeRow(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Its state as tables have it."""
+        """The state of the node as tables show it."""
         return SILENT if self.silent else self.state.capitalize()
 
 
@@ -171,7 +171,7 @@ USAGE = (
         cell=lambda row: format_memory(row.memory_peak)),
     Fact("memory_limit_bytes", "memory_limit"),
 )  # fmt: skip
-"""Those of a group, which a whole dataflow has, too. Their metrics come from its counters."""
+"""Facts of a cgroup, which a whole dataflow has, too. Their metrics come from its counters."""
 
 NODE_FACTS = (
     Fact("node", column="NODE"),

@@ -70,7 +70,7 @@ class Place(StrEnum):
     MEMORY = "memory"
     NOWHERE = "nowhere"
     STOPPED = "stopped"
-    """It does not run."""
+    """The unit does not run."""
     UNKNOWN = "unknown"
 
 
@@ -87,7 +87,7 @@ def storage_of(config: str) -> str:
 
 
 def judge_journal(place: Place, storage: str) -> Finding:
-    """One finding: whether what is written now is still there after a reboot.
+    """Judge whether records that are written now will exist after a reboot.
 
     Files alone prove nothing: those of an earlier Storage= stay where they are.
     """

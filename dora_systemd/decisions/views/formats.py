@@ -36,7 +36,7 @@ def format_count(count: int | None) -> str:
 
 
 def format_watchdog(age: int | None, limit: int | None) -> str:
-    """As in "1.2s/5s": the age of the last sign, and the watchdog; "" without any."""
+    """Format "1.2s/5s", the age of the last WATCHDOG=1 and its limit; "" without a watchdog."""
     if age is None and limit is None:
         return ""
     known = UNKNOWN if age is None else f"{age / SECOND:.1f}s"
@@ -52,5 +52,5 @@ def local_time(moment: int, form: str = "%Y-%m-%d %H:%M:%S") -> str:
 
 
 def zoned_time(moment: int) -> str:
-    """As local_time(), with the name of the zone behind it."""
+    """Format a time as local_time() does, followed by the name of the zone."""
     return local_time(moment, "%Y-%m-%d %H:%M:%S %Z")

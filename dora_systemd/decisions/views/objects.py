@@ -20,7 +20,7 @@ SCHEMA = 1
 """The version of all objects. New keys leave it; anything else makes it one more."""
 
 Shares = Mapping[str, float]
-"""By resource, the percentage of the time in which some process waited for it."""
+"""The percentage of the time in which some process waited, by resource."""
 
 
 def format_json(value: Any, indent: int | None = None) -> str:
@@ -55,7 +55,7 @@ def switch_object(name: str, one: Switch) -> dict[str, Any]:
 
 
 def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None) -> dict[str, Any]:
-    """A dataflow with its nodes, the same wherever one is printed.
+    """Return the JSON object of a dataflow with its nodes, equal in all verbs.
 
     waits: by node, WHOLE_CELL is the whole dataflow; only `top` knows them.
     """

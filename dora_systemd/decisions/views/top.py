@@ -53,7 +53,7 @@ class TopRow(NamedTuple):
 
     @property
     def key(self) -> tuple[str, str]:
-        """What stays the same from one reading to the next."""
+        """The identity of the row, which does not change between readings."""
         return self.uuid, self.node
 
 

@@ -106,11 +106,11 @@ class TopScreen:
         at = self._targets().get(key)
         if at is not None and self._rows:
             self._at = max(min(at, len(self._rows) - 1), 0)
-            # Whoever looks at the first row wants to see which one it is.
+            # With the first row selected, keep showing the first row, whichever it is now.
             self._chosen = self._rows[self._at].key if self._at else None
 
     def _targets(self) -> dict[str, int]:
-        """By key, the place of the row that it selects."""
+        """The index of the row that each key selects."""
         return {
             "KEY_UP": self._at - 1,
             "KEY_DOWN": self._at + 1,

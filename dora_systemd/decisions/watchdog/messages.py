@@ -15,7 +15,7 @@ MAX_STATUS = 200
 
 
 class Message(NamedTuple):
-    """One message. status: the text of STATUS=, None without one; "" takes the last one back."""
+    """One message. status: the text of STATUS=, None without one; "" clears the last text."""
 
     is_alive: bool = False
     is_trigger: bool = False

@@ -1,6 +1,6 @@
-"""Which nodes have a notify socket, and the time in which each of them owes a WATCHDOG=1.
+"""Which nodes have a notify socket, and the time within which each must send a WATCHDOG=1.
 
-The words are those of WatchdogSec= in systemd.service(5) and of sd_notify(3).
+The terms are those of WatchdogSec= in systemd.service(5) and of sd_notify(3).
 """
 
 from collections.abc import Iterable, Mapping
@@ -49,7 +49,7 @@ def parse_sockets(texts: Iterable[str]) -> dict[str, int]:
 
 
 def format_watchdogs(watchdogs: Watchdogs) -> list[str]:
-    """The texts from which parse_watchdogs makes the same."""
+    """Format watchdogs as texts, the inverse of parse_watchdogs()."""
     return [
         f"{node}={format_duration(limit)}" if node else format_duration(limit)
         for node, limit in watchdogs.items()

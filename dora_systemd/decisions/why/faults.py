@@ -24,7 +24,7 @@ class Fault(NamedTuple):
 
     reason: str
     node: str = ""  # the first that failed, or ""
-    is_stop: bool = False  # somebody has stopped the dataflow, so nothing is started in its place
+    is_stop: bool = False  # the dataflow was stopped by a request, so nothing is started instead
     is_outside: bool = False  # the trial could not continue for a reason outside the release
     invocation: str = ""  # of systemd, the life in which it was
     lines: tuple[str, ...] = ()  # the last ones of the node, or of all nodes, oldest first
@@ -50,7 +50,7 @@ def find_fault(
 
 
 def is_finished(happenings: Iterable[Happening]) -> bool:
-    """Whether all nodes have ended by themselves, and nobody has stopped them.
+    """Return whether all nodes have ended by themselves, without a request to stop.
 
     happenings: newest first.
     """

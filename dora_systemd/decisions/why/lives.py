@@ -174,7 +174,7 @@ def ended_nodes(life: Life) -> tuple[NodeRow, ...]:
             row = rows.get(one.node, NodeRow(one.node, "", restarts=0))
             rows[one.node] = _after(row, one, is_stopping)
     end = life.last("dataflow-failed")
-    # Nodes that never became ready, or that another one took along, have no event of their own.
+    # Nodes that never became ready, or that ended with another node, have no event of their own.
     for node in end.detail("nodes").split() if end else ():
         rows[node] = rows.get(node, NodeRow(node, "", restarts=0))._replace(state="failed")
     return tuple(_closed(row, life) for row in rows.values())

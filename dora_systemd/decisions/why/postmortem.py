@@ -22,7 +22,7 @@ from dora_systemd.values import SECOND
 
 _CRASHES = ("node-crashed", "node-ended", "node-oom")
 _LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST, Cause.MACHINE_LOST)
-"""Their events have the same names."""
+"""Causes with the same names as their events."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
 _KILLED = "the supervisor process was killed"
@@ -117,7 +117,7 @@ def ended_word(life: Life, known: str = "") -> str:
 
 
 def _present(life: Life, facts: Facts) -> Verdict:
-    """The state of a running dataflow: the node that failed for good, else the last restart."""
+    """Describe a running dataflow: a node that failed and stays down, else the last restart."""
     gone = [one for one in final_crashes(life) if one.node in facts.failed]
     if gone:
         # The live table has the number of restarts.
@@ -199,7 +199,7 @@ def _failure(life: Life, end: Happening) -> Verdict:
 
 
 def _ends(reason: str, named: Sequence[str]) -> dict[str, str]:
-    """By node how it ended, from the reason of a failed dataflow."""
+    """Parse how each node ended, from the reason of a failed dataflow."""
     parts = (one.partition(": ") for one in f", {reason}".split(", node "))
     return {node: how for node, _, how in parts if node in named}
 
@@ -338,7 +338,7 @@ _FRESH = {
 
 
 def _counted(restarts: Sequence[Restart], life: Life, facts: Facts) -> list[Restart]:
-    """Those that `list` counts: by systemd since the last reset, and by dora in this run."""
+    """The restarts that `list` counts: by systemd since the last reset, by dora in this run."""
     fresh = [one for one in life.all(*_FRESH) if _what(one) in _FRESH[one.name]]
     since = {one.node: one.at_us for one in fresh}
     begin = max(life.began_us, since.get("", 0))

@@ -50,7 +50,7 @@ _MEMORY_REMEDIES = {
     "dataflow": _MORE_MEMORY,
     "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
 }
-"""By the owner of the exceeded memory limit, unless it is the node."""
+"""Remedies by the owner of the exceeded memory limit, unless that is the node."""
 _SIGNAL_REMEDIES: Mapping[int, str] = {
     signal.SIGKILL: "find out who killed {node}: journalctl -k, or somebody's kill -9",
     **dict.fromkeys(

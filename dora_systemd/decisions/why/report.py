@@ -139,7 +139,7 @@ def _of_passing(report: Report) -> list[str]:
 
 
 def _away(verdict: Verdict) -> str:
-    """As "camera stays", "camera, plot stay"."""
+    """Format "camera stays", "camera, plot stay"."""
     verb = "stay" if verdict.others else "stays"
     return f"{', '.join((verdict.node, *verdict.others))} {verb}"
 
@@ -207,7 +207,7 @@ def _facts(report: Report) -> list[str]:
 
 
 def _machine_words(machines: Mapping[str, str]) -> str:
-    """As "head, gpu (alice@gpu-box)"; nothing for one machine."""
+    """Format "head, gpu (alice@gpu-box)"; "" for one machine."""
     others = (f"{name} ({host})" if host else name for name, host in machines.items())
     return ", ".join((HEAD, *others)) if machines else ""
 
@@ -262,7 +262,7 @@ def _memory_words(details: Mapping[str, str]) -> str:
 
 
 def _restart_words(restarts: Sequence[Restart]) -> str:
-    """As "detector 3 (exit code 1), all of it 1 (the dora daemon is gone)"."""
+    """Format "detector 3 (exit code 1), all of it 1 (the dora daemon is gone)"."""
     groups: dict[tuple[str, str], int] = {}
     for one in restarts:
         key = (one.node or "dataflow", one.reason)

@@ -15,7 +15,7 @@ class Facts:
 
     status: str = ""  # a word of `list`
     text: str = ""  # STATUS=
-    failed: Mapping[str, str] = field(default_factory=dict)  # nodes that have failed for good
+    failed: Mapping[str, str] = field(default_factory=dict)  # nodes that failed and stay down
     restarting: tuple[str, ...] = ()  # nodes that wait for a restart
     now_boot: str = ""  # id of this boot
     restarts: int | None = None  # NRestarts= of the unit, None if systemd has unloaded it
@@ -23,7 +23,7 @@ class Facts:
     silent: Mapping[str, str] = field(default_factory=dict)
     is_held: bool = False  # whether systemd has not begun the start that it has in its queue
     is_gathering: bool = False  # whether it waits for another machine
-    # nodes that somebody has stopped, and who
+    # nodes that were stopped by a request, and who requested that
     stopped: Mapping[str, str] = field(default_factory=dict)
     policy: str = ""  # its restart policy, "" if that is not known
 
@@ -63,7 +63,7 @@ class Verdict:
     before: str = ""  # how the life before these ended, and when
     before_us: int = 0
     nodes: tuple[NodeRow, ...] = ()  # of a dataflow that has ended, as its events name them
-    # nodes of one that is up which somebody has stopped, and who
+    # nodes of a running dataflow that were stopped by a request, and who requested that
     stopped: Mapping[str, str] = field(default_factory=dict)
     policy: str = ""  # see Facts
     others: tuple[str, ...] = ()  # nodes that failed by themselves after `node`
@@ -75,7 +75,7 @@ class Verdict:
 
     @property
     def is_away(self) -> bool:
-        """Whether a node of a running dataflow has ended for good."""
+        """Whether a node of a running dataflow has ended and will not restart."""
         is_there = self.cause is Cause.NODE_SILENT and "exit" not in self.details
         is_kept = self.is_passing or self.status == RESTARTING or is_there
         return self.is_up and bool(self.node) and not is_kept
