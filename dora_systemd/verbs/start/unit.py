@@ -10,6 +10,7 @@ from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.properties.assignments import (
     NOTHING_NEWER,
     Newer,
+    Properties,
     unknown_keys,
     with_properties,
 )
@@ -22,6 +23,7 @@ from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, drop_unsupported
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.trust.paths import exists
 from dora_systemd.values import quoted
@@ -103,10 +105,19 @@ def format_plan(plan: Plan, manager: Callable[[], Manager], target: str | None =
     would start it at boot.
     """
     head = f"# {plan.unit}\n# source: {plan.options.dataflow}\n"
-    text = format_unit(_properties(plan, manager))
+    text = format_unit(_supported(_properties(plan, manager), manager))
     if target is not None:
         text = persistent_unit([text], plan.options, plan.scope.is_user, target)
     return head + text + "".join(_format_links(plan))
+
+
+def _supported(properties: Properties, manager: Callable[[], Manager]) -> Properties:
+    """Those that this systemd has; all of them where there is none."""
+    try:
+        number = systemd_number(manager())
+    except DoraSystemdError:
+        return properties
+    return drop_unsupported(properties, number)[0]
 
 
 def _format_links(plan: Plan) -> Iterator[str]:

@@ -111,6 +111,21 @@ def test_plan_as_text() -> None:
     assert at_boot.endswith("\n[Install]\nWantedBy=dora.target\n")
 
 
+def test_the_text_has_what_this_systemd_has() -> None:
+    manager = FakeManager()
+    assert "\nDelegateSubgroup=" in format_plan(make_plan(), lambda: manager)
+    manager.systemd = "252.39-1~deb12u1"
+    assert "\nDelegateSubgroup=" not in format_plan(make_plan(), lambda: manager)
+
+
+def no_manager() -> FakeManager:
+    raise DoraSystemdError("cannot reach systemd", "", ExitCode.NO_SYSTEMD)
+
+
+def test_the_text_needs_no_systemd() -> None:
+    assert "\nDelegateSubgroup=" in format_plan(make_plan(), no_manager)
+
+
 NEW = ("FileDescriptorStorePreserve=on-success", "PrivateBPF=yes")
 
 
