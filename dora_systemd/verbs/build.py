@@ -1,8 +1,8 @@
 """`doractl build`: builds the nodes of a dataflow where its files are: `uv sync` and `dora build`.
 
-As the user who runs the nodes, and never as root. That user can change all that a build runs, so as
-root the build has a unit of its own, without our terminal and with no more than that user's rights.
-For other callers it is a child process.
+A build runs as the user who runs the nodes, and never as root. That user can change all that a
+build executes, so for root the build has a unit of its own, without our terminal and with no more
+than that user's rights. For other callers the build is a child process.
 """
 
 import codecs
@@ -89,7 +89,7 @@ class Project(NamedTuple):
 
     @property
     def task(self) -> BuildTask:
-        """What the program of the build is told."""
+        """The task of the program in the build's unit."""
         path = str(PurePath(self.dataflow).parent)
         return BuildTask(shown(self.dataflow), "", "", path, self.commands, is_shown=True)
 
@@ -196,7 +196,7 @@ def _find_lock(read: Read) -> str:
 
 
 def _venv_of(read: Read, lock: str) -> str:
-    """The virtual environment that uv makes: where `start` looks for it."""
+    """Return the path of the virtual environment that uv creates, where `start` searches it."""
     given = read.look.settings[VENV]
     if given is not None:
         return str(Path(given).absolute())

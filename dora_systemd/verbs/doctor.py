@@ -213,14 +213,15 @@ def _journal(reach: Callable[[Scope], Manager], scope: Scope) -> Iterator[Findin
     try:
         journal_reader.check_readable(scope)
     except DoraSystemdError as error:
-        if place is Place.UNKNOWN or error.code is not ExitCode.NO_SYSTEMD:  # else it says the same
+        # Otherwise judge_journal() below reports the same problem.
+        if place is Place.UNKNOWN or error.code is not ExitCode.NO_SYSTEMD:
             yield Finding("journal", State.WARNING, error.message, error.hint)
     yield judge_journal(place, storage_of(config))
     yield rate
 
 
 def _journal_place(reach: Callable[[Scope], Manager]) -> Place:
-    """Where the system's journald has written since it was started."""
+    """Find where the system's journald has written since its start."""
     try:
         facts = reach(scope_of(is_user=False)).read(JOURNALD, ["ActiveState", _STARTED])
     except DoraSystemdError:
@@ -283,7 +284,7 @@ def _user(scope: Scope, _root: Path) -> Iterator[Finding]:
 
 
 def _settings(scope: Scope, root: Path) -> Iterator[Finding]:
-    """Check the settings files for all dataflows; `start` checks the one beside a dataflow."""
+    """Check the settings files for all dataflows; `start` checks the one next to a dataflow."""
     for path in (_below(root, one) for one in config_files(os.environ)):
         if exists(path):
             try:

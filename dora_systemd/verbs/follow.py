@@ -5,10 +5,10 @@ calls journalctl once for each step: first for the existing records, then for th
 cursor, and once more after the end. A cursor file connects the steps, --cursor-file= in
 journalctl(1).
 
-UnitWatch, a `journalctl --follow` that prints only message IDs, tells when to take the next step.
-It starts before the first step, so no record is missed between the two. systemd logs the end of a
-unit on restarts too; so the ActiveState and the job of the unit decide whether more will come. The
-order matters: is_up() comes before the last step, or records written in between would be missing.
+UnitWatch, a `journalctl --follow` that prints only message IDs, triggers the next step. UnitWatch
+starts before the first step, so no record is missed between the two. systemd logs the end of a unit
+on restarts too; so the ActiveState and the job of the unit decide whether more will come. The order
+matters: is_up() comes before the last step, or records written in between would be missing.
 """
 
 import time
@@ -36,7 +36,7 @@ from dora_systemd.verbs.logs import Follower, find_span
 STEP_SECONDS = 0.2
 """At least this long between two steps: journalctl needs tens of ms to open all journal files."""
 POLL_SECONDS = 2.0
-"""Without new records, ask systemd this often: the record of the unit's end can be missing."""
+"""Interval of the checks of the unit without new records: that of its end can be missing."""
 END_SECONDS = 3.0
 FIRST_LINES = 10
 """The default of journalctl --follow."""
@@ -45,7 +45,7 @@ _CHUNK = 1 << 18
 
 
 class Watch(Protocol):
-    """What tells follow_steps() that there is something new: a UnitWatch."""
+    """The part of UnitWatch that follow_steps() needs."""
 
     def wait(self, seconds: float) -> bool:
         """Wait for a new record, at most `seconds`; whether there is one."""
@@ -118,10 +118,10 @@ def _steps(query: LogQuery, cursor: Path, start_us: int) -> Iterator[LogQuery]:
 
 
 def _with_cursor(query: LogQuery, cursor: Path) -> LogQuery:
-    """The step as journalctl takes it, which leaves the cursor of its last record.
+    """Return the query for journalctl, which writes the cursor of its last record to a file.
 
-    journalctl refuses --cursor-file with --since, and would leave that of the oldest record for
-    --grep with --lines. For these this asks first where the records are.
+    journalctl refuses --cursor-file with --since, and with --grep and --lines would write the
+    cursor of the oldest record. For such a query find_span() first finds the records.
     """
     if not query.since and not (query.grep and query.is_counted):
         return query

@@ -50,7 +50,7 @@ class Lock:
         return True
 
     def renew(self) -> None:
-        """Take the lock if the file that it is on is not that of the dataflow any more."""
+        """Take the lock again if the dataflow has another lock file since."""
         with suppress(DoraSystemdError):
             place = find_lock(self._directory)
             if place and (self._lock is None or place != place_of(self._lock)):
@@ -64,7 +64,7 @@ class Lock:
 
 
 def take_inhibiting(scope: Scope, cell: Cell, reason: str) -> Lock:
-    """A lock of a running dataflow, and the event that says so. Raises DoraSystemdError."""
+    """Lock a running dataflow, and record that as an event. Raises DoraSystemdError."""
     if not cell.has_begun:
         message = f"cannot inhibit {cell.name}: it is not running"
         raise DoraSystemdError(message, f"doractl start {cell.name}", ExitCode.NOT_RUNNING)

@@ -31,7 +31,7 @@ from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.scope import Scope, config_home
 
 _TURN = 1 << 14
-"""Bytes of records between two looks at what else has happened: a terminal may be slow."""
+"""Bytes of records between two checks for other events: a terminal may be slow."""
 AGAIN_SECONDS = 1.0
 """Pause before another journalctl if one dies; it doubles."""
 _MOST_SECONDS = 30.0
@@ -55,7 +55,7 @@ def read_logs(
     for data in journal_output(arguments, want_colors=want_colors):
         yield terminal.feed(data)
         if query.is_follow:
-            yield terminal.flush()  # what has come is shown at once
+            yield terminal.flush()  # show received lines at once
     yield terminal.flush()
 
 
@@ -83,7 +83,7 @@ def write_whole(data: bytes, fd: int) -> None:
 
 
 def _oldest_first(query: LogQuery) -> LogQuery:
-    """The query for the same records in the order of time: --grep with --lines reverses it."""
+    """Return the query for its records in the order of time, which --grep with --lines reverses."""
     if not (query.grep and query.is_counted) or query.is_follow or query.is_reverse:
         return query
     span = find_span(query)
@@ -153,7 +153,7 @@ class Follower:
         os.set_blocking(self._fd, False)
 
     def _lose(self) -> None:
-        """There is nothing to read until the next journalctl, which must not be asked for often."""
+        """Stop reading until the next journalctl, which starts after a growing pause."""
         self._stack.close()
         idle, other = os.pipe()
         self._use(idle)
@@ -163,7 +163,7 @@ class Follower:
         self._pause = min(2 * self._pause, _MOST_SECONDS)
 
     def fileno(self) -> int:
-        """For poll(2): readable when there may be records."""
+        """Return a descriptor for poll(2): readable when there may be records."""
         return self._fd
 
     def is_readable(self, seconds: float) -> bool:
@@ -175,7 +175,7 @@ class Follower:
         return bool(self._poll.poll(seconds * 1000))
 
     def read(self, size: int) -> bytes | None:
-        """At most `size` bytes, None if there is nothing to read now."""
+        """Read at most `size` bytes; None if there is nothing to read now."""
         if self._due <= time.monotonic():
             self._open()
         with suppress(BlockingIOError):
@@ -208,7 +208,7 @@ class FollowedLog(Follower):
     ) -> None:
         matches = [*query_matches(LogQuery(scope, name=name, uuid=uuid)), "+"]
         matches += end_matches(scope, name)
-        # After the first Ctrl+C the nodes still have to say something.
+        # After the first Ctrl+C the nodes may still write lines.
         super().__init__(since_us, _FIELDS, matches, outlives_interrupt=True)
         self.has_ended = False
         self._write = write
@@ -220,7 +220,7 @@ class FollowedLog(Follower):
         self._records = ExportReader()  # without half a record
 
     def print_new(self) -> None:
-        """Write some of the lines that have come: a flood of them must not keep the caller here."""
+        """Write some of the received lines: a flood of lines must not block the caller."""
         if data := self.read(_TURN):
             self._print(data)
 

@@ -84,10 +84,10 @@ def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
 
 @dataclass(frozen=True)
 class NodeOrder:
-    """What is asked of one node. what: RESTART or STOP of decisions/cell/status.py.
+    """A request for one node. what: RESTART or STOP of decisions/cell/status.py.
 
-    by: the door, such as "doractl node stop". grace: µs that its process has to end; None: that of
-    the dataflow.
+    by: the command or page, such as "doractl node stop". grace: µs that the node's process has to
+    end; None: that of the dataflow.
     """
 
     what: str
@@ -104,10 +104,10 @@ def order_node(
     how: IfInhibited = IfInhibited.REFUSE,
     tell: Tell | None = None,
 ) -> str:
-    """Have the runner restart or stop one node; what it does, for people.
+    """Have the runner restart or stop one node; return the human-readable result.
 
-    The runner records who has asked, and uses none of the restarts that the node's policy allows.
-    how, tell: as for uninhibited(). Raises DoraSystemdError, also while a lock inhibits it.
+    The runner records the requester, and uses none of the restarts that the node's policy allows.
+    how, `tell`: as for uninhibited(). Raises DoraSystemdError, also while a lock inhibits it.
     """
     require_running(cell)
     refuse_parts([cell], CONTROL)
@@ -199,8 +199,8 @@ def dora_environment(coordinator: Coordinator) -> dict[str, str]:
 def require_node(scope: Scope, cell: Cell, node: str) -> None:
     """Raise DoraSystemdError (NOT_FOUND) unless the dataflow has this node.
 
-    Without a readable table nobody knows here: the runner's socket refuses another user, and the
-    runner refuses an unknown node.
+    Without a readable table the node is not checked: the runner's socket refuses another user, and
+    the runner refuses an unknown node.
     """
     status = read_status(scope, cell)
     if status.nodes and node not in status.nodes:

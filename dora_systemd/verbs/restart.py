@@ -1,6 +1,6 @@
-"""`doractl restart`: restarts what systemd has loaded, unless the next start would be refused.
+"""`doractl restart`: restarts loaded dataflows, unless the next start would be refused.
 
-act_on() is the same for the views, which also stop.
+act_on() does that for the views, which also stop dataflows.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,8 +1,8 @@
 """`doractl set`: changes limits of a dataflow and its nodes, and makes them persistent.
 
 systemd stores the limits of the dataflow, as for `systemctl set-property`. The limits of nodes are
-in a drop-in of ours beside systemd's. Drop-ins of a transient unit disappear with it, those of a
-unit file when the file is removed.
+in a drop-in of ours next to systemd's. Drop-ins of a transient unit disappear with the unit, those
+of a unit file when the file is removed.
 """
 
 import os
@@ -53,10 +53,10 @@ def set_limits(
     is_forced: bool = False,
     ask: Ask = order,
 ) -> tuple[str, ...]:
-    """Change limits of a dataflow; warnings. If it does not run, they are those of its next start.
+    """Change limits of a dataflow, or of its next start if it does not run; return warnings.
 
     flags: raw values by name of CHANGEABLE. is_forced: also memory limits below the current
-    usage. ask: of the runner. Raises DoraSystemdError; then nothing is changed.
+    usage. `ask`: sends a request to the runner. Raises DoraSystemdError; then nothing is changed.
     """
     settings = resolve_settings(flags, {}, (), CHANGEABLE)
     properties, nodes = settings_properties(settings), settings[NODE_LIMIT]

@@ -29,14 +29,14 @@ KILLED_SECONDS = 10.0
 """Timeout for the end of processes that were killed."""
 POLL_SECONDS = 0.05
 THAWED = "thawed first, it was frozen"
-"""Note of what was frozen: systemd refuses to stop it, and may hang if it is killed."""
+"""Note about a frozen unit: systemd refuses to stop such a unit, and may hang if it is killed."""
 
 Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A dataflow that was told to stop. note: how it ended, or "". problem: why it has not."""
+    """A dataflow with a requested stop. note: how it ended, or "". problem: why it has not."""
 
     cell: Cell
     note: str = ""
@@ -119,7 +119,7 @@ def stop_within(
 
 
 def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
-    """For dataflows that were enabled while running: let the unit file take effect."""
+    """Let the unit files of dataflows take effect that were enabled while running."""
     enabled = enabled_units(manager, scope).intersection(units)
     if not enabled:
         return
@@ -141,7 +141,7 @@ def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> Non
 
 
 def drop_disabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
-    """For dataflows that were disabled while running, and are inactive: remove the unit file."""
+    """Remove the unit files of inactive dataflows that were disabled while running."""
     if not units:
         return
     with suppress(DoraSystemdError):
@@ -181,7 +181,7 @@ def end_links_of(manager: Manager, cells: Sequence[Cell]) -> None:
 
 
 def reset_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
-    """Clear the restarts used up by each dataflow, and its failure; what runs goes on running.
+    """Clear the used restarts and the failure of each dataflow; running dataflows keep running.
 
     A failed unit that nothing else holds is gone from systemd then, its logs stay.
     """
@@ -193,7 +193,7 @@ def reset_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[O
 def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
     """Write the event stop-asked for those dataflows that run; a restart stops them, too.
 
-    command: by which it is asked.
+    command: that makes the request.
     """
     for cell in cells:
         if cell.is_up:
@@ -261,7 +261,7 @@ def _begin(manager: Manager, cell: Cell, most: int | None, now: float) -> _Stop:
         # There may be no process, as between two restarts.
         with suppress(DoraSystemdError):
             manager.kill(cell.unit, signal.SIGKILL)
-        # ExecStopPost= runs now, and systemd allows it the same time again.
+        # ExecStopPost= runs now, for which systemd allows as much time again.
         return _Stop(cell, now + max(KILLED_SECONDS, seconds), True, thawed)
     limit = seconds if most is None else min(seconds, most / SECOND)
     return _Stop(cell, now + limit, False, thawed)
@@ -297,7 +297,7 @@ def find_dependents(manager: Manager, cells: Sequence[Cell]) -> list[Cell]:
 
 
 def format_dependents(needed: Sequence[Subject], dependents: Sequence[Subject]) -> str:
-    """As "needy needs base and ends with it"; "" without any."""
+    """Format "needy needs base and ends with it"; "" without any."""
     if not dependents:
         return ""
     names, bases = (", ".join(one.name for one in some) for some in (dependents, needed))

@@ -51,9 +51,9 @@ def refuse_problems(findings: Iterable[Finding]) -> None:
 
 
 def make_state(scope: Scope) -> None:
-    """Create the directory of the system's releases, as tmpfiles.d does where that is installed.
+    """Create the directory of the system's releases, as an installed tmpfiles.d does.
 
-    The gateway may only write to it if it is there when the gateway starts.
+    The gateway may only write to the directory if it exists when the gateway starts.
     """
     with suppress(OSError):  # of all that the gateway does, only a rollback needs it
         if not scope.is_user:
@@ -61,7 +61,7 @@ def make_state(scope: Scope) -> None:
 
 
 def open_port(manager: Manager, scope: Scope, port: int | None) -> int:
-    """Have systemd listen on `port`, or that of the unit; the port.
+    """Have systemd listen on `port`, or the port of the unit; return the port.
 
     Raises DoraSystemdError; nothing is changed if the port is not available.
     """

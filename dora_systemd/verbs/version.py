@@ -1,6 +1,6 @@
 """`doractl version`: the versions of doractl, Python, systemd and dora.
 
-own_facts() is what this machine says of itself to a head that may want it as a member.
+own_facts() returns the description of this machine for a head that may use it as a member.
 """
 
 import os
@@ -39,7 +39,7 @@ def _found(read: Callable[[], str]) -> str | None:
 
 
 def own_facts(scope: Scope) -> Facts:
-    """Of the caller's account."""
+    """Describe the caller's account on this machine."""
     versions = read_versions(scope)
     return Facts(
         doractl=versions["doractl"] or "",

@@ -215,8 +215,8 @@ def _own_matches(scope: Scope, subject: Subject) -> list[str]:
 def words_of_start(manager: Manager, scope: Scope, uuid: str) -> list[str]:
     """The last lines of a dataflow whose start failed, with their node, oldest first.
 
-    They are those of the node that failed first; of all nodes, if it has written nothing or is not
-    known. [] if they are not readable.
+    The lines are those of the node that failed first; of all nodes, if that node has written
+    nothing or is not known. [] if the journal cannot be read.
     """
     journal = JournalReader()
     with suppress(DoraSystemdError):

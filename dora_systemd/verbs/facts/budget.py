@@ -54,9 +54,10 @@ def restart_budget(
 
 @lru_cache
 def _starts(scope: Scope, name: str, restarts: int, _life: object) -> list[int]:
-    """The starts that NRestarts= counts, and the one before them; CLOCK_REALTIME µs.
+    """Read the starts that NRestarts= counts, and the start before them; CLOCK_REALTIME µs.
 
-    _life: another one, or another state, asks the journal again; `top` and the page ask often.
+    _life: part of the key of the cache, because `top` and the page call this often: the journal is
+    only read again for another life or state.
     """
     if not restarts:
         return []
@@ -84,7 +85,7 @@ def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
 
 
 def read_restarts(manager: Manager, cell: Cell) -> int:
-    """Ask systemd how often it has restarted the unit of a dataflow."""
+    """Read from systemd how often it has restarted the unit of a dataflow."""
     counted = int(manager.read(cell.unit, ["NRestarts"])["NRestarts"])
     return without_refused(manager, cell, counted)
 

@@ -25,7 +25,7 @@ _PATTERN = f"{UNIT_PREFIX}*{UNIT_SUFFIX}"
 class Cell:
     """One dataflow that systemd has loaded: the state of its unit, and its runner's options.
 
-    manager: is asked for the options at their first use. options: those that are known already.
+    manager: reads the options at their first use. options: if they are known already.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Cell:
         return self.state.active == "failed" and not self.state.is_held
 
     def word(self, stage: str = "") -> str:
-        """Its status in one word, as status_word(). stage: the runner's own."""
+        """Return the status of the dataflow in one word, as status_word(). stage: the runner's."""
         return status_word(self.state.active, self.state.sub, stage, self.state.is_held)
 
     @property
@@ -94,17 +94,17 @@ class Cell:
 
     @property
     def known_options(self) -> "RunnerOptions | None":
-        """The options, if something has asked for them already."""
+        """The options, if they have been read already."""
         return self._options
 
     @property
     def dataflow(self) -> str:
-        """The path of the descriptor, or "" as long as nobody has asked for the options."""
+        """The path of the descriptor, or "" as long as the options have not been read."""
         return self._options.dataflow if self._options else ""
 
     @property
     def has_options(self) -> bool:
-        """Whether it is ours by its ExecStart=, which its Description= alone does not prove."""
+        """Whether the unit is ours by its ExecStart=; its Description= alone proves nothing."""
         try:
             return bool(self.options)
         except DoraSystemdError as error:
@@ -124,9 +124,10 @@ def read_cells(manager: Manager) -> list[Cell]:
 
 
 def proven(cells: Iterable[Cell]) -> list[Cell]:
-    """Those that are ours by their ExecStart=, with their options: one question for each.
+    """Return the cells that are ours by their ExecStart=, with their options: one request each.
 
-    Whatever acts on them or needs their options starts here: systemd forgets these with the unit.
+    Whatever acts on dataflows or needs their options begins with proven(): systemd discards the
+    options with the unit.
     """
     return [cell for cell in cells if cell.has_options]
 
@@ -149,7 +150,7 @@ def _listed(manager: Manager, state: UnitState) -> Cell | None:
 
 
 def _asked(manager: Manager, state: UnitState) -> Cell | None:
-    """The dataflow of a unit by its ExecStart=: its owner may have changed Description=."""
+    """Read the dataflow of a unit by its ExecStart=, as the owner may change Description=."""
     options = _read_options(manager, state.unit)
     return Cell(state, options.uuid, manager, options) if options else None
 

@@ -25,11 +25,11 @@ def wanted_units(directory: Path) -> frozenset[str]:
 
 
 def lost_units(manager: Manager, scope: Scope) -> frozenset[str]:
-    """The enabled units that systemd does not know, although their files are there.
+    """Find the enabled units that systemd does not know, although their files exist.
 
-    systemd notes where the file of each unit name is. For a transient unit it notes the fragment,
-    and keeps the note when the unit has ended and the fragment is gone. Only a reload makes it look
-    for the enabled file (seen with systemd 257).
+    systemd caches the path of each unit's file. For a transient unit that is the fragment, and
+    stays so when the unit has ended and the fragment is gone. Only a reload makes systemd search
+    the enabled file (seen with systemd 257).
     """
     directory = own_directories(manager, scope)[0]
     unknown = (

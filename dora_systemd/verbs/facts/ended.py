@@ -60,7 +60,7 @@ def newest_ended(
 
 
 def with_cause(scope: Scope, row: DataflowRow) -> DataflowRow:
-    """The row, with what `why` says if no event of ours has recorded the end."""
+    """Return the row, with the verdict of `why` if no event of ours has recorded the end."""
     if row.text != NO_END:
         return row
     # Imported late: the end is recorded unless the machine went down, or nothing of ours ran.
@@ -79,13 +79,13 @@ def with_cause(scope: Scope, row: DataflowRow) -> DataflowRow:
 
 
 def read_end(manager: Manager, scope: Scope, row: DataflowRow) -> DataflowRow:
-    """The row of a loaded unit that is not up, with the time of its end, and why it failed."""
+    """Return the row of a loaded unit that is down, with the time and the reason of its end."""
     return _with_end(manager, row, next(iter(_last_events(scope, limit=1, name=row.name)), None))
 
 
 def _with_end(manager: Manager, row: DataflowRow, event: LastEvent | None) -> DataflowRow:
-    # The event says more than systemd, which forgets an enabled unit, too. But a failure before the
-    # runner has begun has no event.
+    # The event has more facts than systemd, which unloads an enabled unit, too. But a failure
+    # before the start of the runner has no event.
     times = manager.read(row.unit, _TIMES)
     is_own = event and event.uuid == row.uuid and event.at_us >= times["InactiveExitTimestamp"]
     own = event if is_own else None
@@ -128,10 +128,10 @@ def _remembered(scope: Scope, events: list[LastEvent]) -> list[LastEvent]:
 
 
 def _with_later_failures(scope: Scope, events: list[LastEvent]) -> list[LastEvent]:
-    """The events; the last start of a dataflow may have failed before our code recorded anything.
+    """Return the events with later failed starts, which our code could not record.
 
-    As when systemd cannot set up the sandbox for the second half of a restart. For dataflows of a
-    user nothing says which one has failed.
+    Such as when systemd cannot set up the sandbox for the second half of a restart. For dataflows
+    of a user no record contains which dataflow has failed.
     """
     clean = [event for event in events if event.event in _CLEAN]
     if scope.is_user or not clean:

@@ -1,8 +1,8 @@
 """Dataflows that systemd has not begun to start: what their start waits for, and since when.
 
-systemd knows which jobs a job waits for. It does not tell when it has queued a job, so that is the
-latest of what comes before: the boot, the end of the last run, and the file of a transient unit,
-which systemd writes when it queues its start.
+systemd knows which jobs a job waits for, but reports no time when a job was queued. So that time is
+the latest of what comes before: the boot, the end of the last run, and the file of a transient
+unit, which systemd writes when it queues the start of the unit.
 """
 
 import time
@@ -32,7 +32,7 @@ class Held(NamedTuple):
 
     @property
     def text(self) -> str:
-        """As "the start waits for network since 2026-11-22 14:02:11 UTC", or ""."""
+        """Format "the start waits for network since 2026-11-22 14:02:11 UTC", or ""."""
         return format_wait(START, self.needs, self.since_us) if self.needs else ""
 
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
-    """All that `list` knows of one dataflow.
+    """Return the row of one dataflow with all its facts.
 
     before: an earlier reading of the same run, the base for CPU and throttling; without it, the
     samples of the runner.
@@ -50,7 +50,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "status": reading.word,
         "dataflow": cell.dataflow,
         "listed_release": cell.release,
-        # The status says "failed" already.
+        # The status is "failed" already.
         "text": _text(unit, status).removeprefix(FAILED_BECAUSE),
         "restarts": unit["NRestarts"],
         "problem": reading.problem,
@@ -68,12 +68,12 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
 
 
 def _text(unit: Mapping[str, Any], status: CellStatus) -> str:
-    """The STATUS= of a unit; the table does not ask for it, and needs it for what waits."""
+    """The STATUS= of a unit, or of the live table for a waiting dataflow in a row of the table."""
     return str(unit.get("StatusText", status.text if status.stage == GATHERING else ""))
 
 
 def _machines(cell: Cell) -> dict[str, Any]:
-    """The machines of a dataflow; none in the table, for which nobody has asked for the options."""
+    """The machines of a dataflow; {} for a row of the table, which does not read the options."""
     options = cell.known_options
     if options is None or not options.placed:
         return {}
@@ -94,10 +94,9 @@ def read_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
 
 
 def table_rows(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[DataflowRow]:
-    """The rows of the table, by a number of questions that does not depend on theirs.
+    """Return the rows of the table, by a number of requests that does not depend on their number.
 
-    Except for dataflows that are down, on their way up or down, or have been restarted: each of
-    them has some questions of its own.
+    Dataflows that are down, starting, stopping, or have been restarted need some requests each.
     """
     slice_path = slice_group(manager) if cells else None
     rows = [row_of(read_dataflow(manager, scope, cell, slice_path, is_row=True)) for cell in cells]
@@ -105,9 +104,9 @@ def table_rows(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Da
 
 
 def mark_enabled(manager: Manager, scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:
-    """The rows, with a mark on those that are started at boot.
+    """Mark the rows of dataflows that are started at boot.
 
-    Of several with the same unit it is the first one; the others are gone.
+    Of several rows with the same unit the first is marked; the other dataflows are gone.
     """
     units = set(enabled_units(manager, scope))
     marked = []
@@ -158,13 +157,13 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
 
 
 def _rights(cell: Cell) -> "dict[str, NodeRights] | None":
-    """The rights of nodes; None in the table, for which nobody has asked for the options."""
+    """The rights of nodes; None for a row of the table, which does not read the options."""
     options = cell.known_options
     return options and {one.node: one for one in options.node_rights}
 
 
 def _right_facts(rights: "dict[str, NodeRights] | None", node: str) -> dict[str, Any]:
-    """What of its rights a row has."""
+    """The fields of a row about the rights of a node."""
     if rights is None or node not in rights:
         return {"essential": None if rights is None else False}
     own = rights[node]
@@ -194,7 +193,7 @@ def _outputs(reading: Reading, node: str) -> tuple[OutputRow, ...]:
 
 
 def _signs(status: CellStatus, node: str, now_us: int) -> dict[str, Any]:
-    """What a node says of itself, as rows have it."""
+    """The fields of a row about the messages of a node to its notify socket."""
     if node not in status.signs:
         return {}
     from dora_systemd.decisions.watchdog.messages import parse_sign, sign_facts

@@ -30,7 +30,7 @@ Tell = Callable[[str], None]
 
 
 def read_holders(scope: Scope, names: Iterable[str]) -> dict[str, tuple[Holder, ...]]:
-    """The holders of locks by dataflow, without dataflows that nobody inhibits.
+    """Return the holders of locks by dataflow, without dataflows that no lock inhibits.
 
     A lock file that is not usable, or that the caller may not see, counts as none.
     """
@@ -100,8 +100,8 @@ def uninhibited(
 ) -> Iterator[None]:
     """Hold the locks of the dataflows exclusively, so that no new lock can inhibit them meanwhile.
 
-    A lock file that a restart replaces is not held any more. verb: what is done to them, for the
-    error. tell: called again and again with what is waited for.
+    A lock file that a restart replaces is not held any more. verb: the action on the dataflows, for
+    the error. `tell`: called at each check with the reason of the wait.
 
     Raises DoraSystemdError: INHIBITED if a lock of one of them is held, BAD_INPUT for a lock file
     that is not usable.
@@ -119,7 +119,7 @@ def require_uninhibited(
     how: IfInhibited = IfInhibited.REFUSE,
     tell: Tell | None = None,
 ) -> None:
-    """As uninhibited(), for an action during which nodes may take the lock."""
+    """Check as uninhibited() does, for an action during which nodes may take the lock."""
     with uninhibited(scope, dataflows, verb, how, tell):
         pass
 
@@ -159,7 +159,7 @@ def _open(scope: Scope, dataflow: Named) -> int | None:
         return open_lock(scope.cell_directory(dataflow.name))
     except DoraSystemdError as error:
         if not read_cell_flocks(scope):
-            return None  # whatever the file is, nobody holds a lock
+            return None  # whatever the file is, no process holds a lock
         hint = "use sudo, or --force to do it in any case"
         raise DoraSystemdError(error.message, hint, error.code) from error
 

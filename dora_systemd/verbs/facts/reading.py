@@ -37,9 +37,10 @@ class Reading(NamedTuple):
 
     unit: properties of its unit; NRestarts without a restart that was refused. problem: why its
     node table is not usable, or "". groups, usage: by node, with the unit's own as WHOLE_CELL;
-    empty for a dataflow that is not running. at_us: time of the reading, CLOCK_MONOTONIC. heard:
+    empty for a dataflow that is not running. at_us: time of the reading, CLOCK_MONOTONIC. `heard`:
     the last message of each owed output, on the same clock, 0 is never. held: what systemd waits
-    for before it starts it. is_frozen: whether somebody has frozen the unit.
+    for before it starts the dataflow. is_frozen: whether the unit is frozen, see
+    `systemctl freeze`.
     """
 
     cell: Cell
@@ -69,7 +70,7 @@ class Reading(NamedTuple):
 
     @property
     def away(self) -> "Mapping[str, NodeUse]":
-        """What nodes on other machines use, as those have said."""
+        """The usage of nodes on other machines, as members report it."""
         if not self.status.usage:
             return {}
         from dora_systemd.decisions.machines.usage import uses_of
@@ -86,8 +87,9 @@ def read_dataflow(
 ) -> Reading:
     """Read one dataflow.
 
-    slice_path: where the groups of dataflows usually are, for a reader of all of them. Then systemd
-    is not asked for what the runner has in its table. is_row: only what the table of `list` shows.
+    slice_path: where the groups of dataflows usually are, for a reader of all dataflows. Then
+    properties that the live table contains are not read from systemd. is_row: only what the table
+    of `list` shows.
     """
     if cell.state.is_held:
         return _read_held(manager, cell)
@@ -137,9 +139,9 @@ def read_heard(scope: Scope, name: str, owes: "Sequence[Owed]") -> tuple[int, ..
 
 
 def _known(cell: Cell, status: CellStatus, is_row: bool) -> dict[str, Any]:
-    """The properties that systemd need not be asked for, because the runner has them in its table.
+    """Return the properties that the live table contains, and that are not read from systemd.
 
-    The dataflow's user can lie in the table, about the own row only.
+    The dataflow's user can forge the table, but only that of the user's own dataflows.
     """
     known: dict[str, Any] = {}
     if cell.state.active in SETTLED:

@@ -71,7 +71,7 @@ def failure_reason(manager: Manager, unit: str) -> str:
     last_words = without_hint(str(facts["StatusText"])).removeprefix(FAILED_BECAUSE)
     if not last_words:
         return special or _exit_words(facts)
-    # The runner's own message says more than its exit status.
+    # The message of the runner explains more than its exit status.
     is_verdict = str(facts["StatusText"]).startswith(FAILED_BECAUSE)
     cause = special or ("" if is_verdict else _exit_words(facts))
     return f"{last_words} ({cause})" if cause else last_words

@@ -17,7 +17,7 @@ from dora_systemd.verbs.facts.ended import not_recorded
 from dora_systemd.verbs.facts.selector import Selector, is_pattern, selectors_of
 
 _MOST_FITTING = 100
-"""Maximum UUIDs with the same beginning: anybody can write records with more."""
+"""Maximum UUIDs with the same beginning: any user can write records with more."""
 
 
 def find_soon(find: Callable[[], LogQuery], scope: Scope, selectors: Sequence[str]) -> LogQuery:
@@ -112,7 +112,7 @@ def _dataflow(
 def _with_nodes(
     journal: JournalReader, queries: list[LogQuery], patterns: Sequence[str]
 ) -> list[LogQuery]:
-    """The queries with their nodes, without those of dataflows that have none of them."""
+    """Add the nodes to the queries; leave out queries of dataflows without any of the nodes."""
     if not queries[0].name:
         hint = "say which dataflow: doractl logs NAME --node NODE"
         raise DoraSystemdError("cannot select nodes of all dataflows", hint, ExitCode.USAGE)

@@ -1,7 +1,7 @@
-"""What a user types to mean a dataflow, and which one it means.
+"""Selectors: finds the dataflow that a name, a unit, a UUID or its beginning selects.
 
-Every search for a dataflow that a user or a client names begins here, so that all of them accept
-the same words and give the same errors. `list` without a name does not load this module.
+Every search for a dataflow that a user or a client names begins here, so that all verbs accept the
+same selectors and report the same errors. `list` without a name does not load this module.
 """
 
 import re
@@ -52,11 +52,11 @@ class Selector:
 
     @property
     def name(self) -> str:
-        """The text, or the name in it if it is a unit of ours; nobody has checked the name."""
+        """The text, or the name in the name of a unit of ours; the name is not checked."""
         return name_from_unit(self.text) or self.text
 
     def meant(self, known: Iterable[N]) -> list[N]:
-        """Those of `known` that match, in their order; a name takes precedence over UUIDs."""
+        """Return those of `known` that match, in their order; a name precedes UUIDs."""
         candidates = list(known)
         for name in self.names:
             if named := [one for one in candidates if one.name == name]:
@@ -96,12 +96,12 @@ class Selector:
         return DoraSystemdError(f"no dataflow named {quoted(self.text)}", hint, ExitCode.NOT_FOUND)
 
     def proven(self, cells: Iterable[Cell]) -> Cell | None:
-        """As only(), with its options; None for a unit that only has a Description= like ours."""
+        """Find the cell as only() does; None for a unit that only has a Description= like ours."""
         cell = self.only(cells)
         return cell if cell and cell.has_options else None
 
     def loaded(self, cells: Iterable[Cell]) -> Cell:
-        """The one of `cells`, from read_cells(), with its options."""
+        """Find the cell among `cells`, from read_cells(), with its options."""
         known = list(cells)
         cell = self.proven(known)
         if cell is None:
@@ -109,7 +109,7 @@ class Selector:
         return cell
 
     def find(self, manager: Manager) -> Cell:
-        """One that systemd has loaded, or can load from a unit file."""
+        """Find a dataflow that systemd has loaded, or can load from a unit file."""
         cells = read_cells(manager)
         names = () if self.only(cells) else filter(is_name, self.names)
         files = filter(None, (read_cell(manager, unit_name(one)) for one in names))
@@ -117,7 +117,7 @@ class Selector:
 
     @contextmanager
     def telling_ended(self, scope: Scope) -> Iterator[None]:
-        """Turn NOT_FOUND into NOT_RUNNING for one that has ended, which only the journal knows."""
+        """Turn NOT_FOUND into NOT_RUNNING for an ended dataflow, which only the journal knows."""
         try:
             yield
         except DoraSystemdError as error:
@@ -129,12 +129,12 @@ class Selector:
             raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING) from error
 
     def find_present(self, manager: Manager, scope: Scope) -> Cell:
-        """As find() and telling_ended()."""
+        """Find a dataflow as find() does, with the error of telling_ended() for an ended one."""
         with self.telling_ended(scope):
             return self.find(manager)
 
     def find_enabled(self, manager: Manager, scope: Scope) -> Cell:
-        """As find(), also an enabled one that systemd has lost, see lost_units()."""
+        """Find a dataflow as find() does, also an enabled one that lost_units() returns."""
         try:
             return self.find(manager)
         except DoraSystemdError as error:
@@ -144,14 +144,14 @@ class Selector:
         return self.find(manager)
 
     def ended(self, scope: Scope) -> "DataflowRow | None":
-        """The newest one of which the journal has an end; None if there is none."""
+        """Find the newest matching dataflow with an end in the journal, or None."""
         # Imported late: the journal is slow, and dataflows that systemd knows do not need it.
         from dora_systemd.verbs.facts.ended import ended_rows
 
         return next(iter(self.meant(ended_rows(scope))), None)
 
     def _recorded(self, scope: Scope) -> "DataflowRow | None":
-        """As ended(), also None for a user who may not read the journal."""
+        """Find an ended dataflow as ended() does; None also if the journal cannot be read."""
         with suppress(DoraSystemdError):
             return self.ended(scope)
         return None

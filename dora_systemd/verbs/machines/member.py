@@ -1,8 +1,8 @@
-"""`doractl member`: the part of a dataflow on this machine, for a head that has come by ssh.
+"""`doractl member`: the part of a dataflow on this machine, for a head that logs in by ssh.
 
-The command line says what runs here, and only the doractl of the head writes that. What the head's
-runner says, whose memory the nodes there can change, is where the coordinator is. The answer to it
-is a Refused if a new attempt is of no use, and else an exit status.
+The command line determines what runs on this machine, and only the doractl of the head writes that
+line. The head's runner, whose memory the nodes on the head can change, only sends where the
+coordinator is. The answer is a Refused if a new attempt cannot help, and else an exit status.
 """
 
 import hashlib
@@ -53,7 +53,7 @@ from dora_systemd.verbs.start.start import make_room, refuse_unit_file, require_
 from dora_systemd.verbs.start.unit import plan_properties, systemd_number
 
 _START_SECONDS = 60.0
-"""For the first words of the runner."""
+"""Timeout of the first line of the runner."""
 _LOOK_SECONDS = 0.1
 _PASSING = (ExitCode.FAILURE, ExitCode.NO_SYSTEMD)
 """Errors that the next attempt may not meet, such as a machine that still boots."""
@@ -84,19 +84,20 @@ def is_passing(error: DoraSystemdError) -> bool:
 
 
 class Teller(Protocol):
-    """Who says what to run: the part of a Head that a start needs."""
+    """The methods of Head that a start needs."""
 
     def part(self) -> Part:
-        """What to run. Raises DoraSystemdError."""
+        """Receive the Part. Raises DoraSystemdError."""
 
     def say(self, line: bytes) -> None:
-        """Say a whole line."""
+        """Send a whole line."""
 
 
 def start_member(manager: Manager, request: MemberRequest, head: Teller) -> socket.socket:
-    """Start the part that the head describes; the connection to its runner, which is its life.
+    """Start the part that the head describes; return the connection to its runner.
 
-    The first line of the runner has been passed on. Raises DoraSystemdError; then nothing runs.
+    The part ends with that connection. The first line of the runner has been passed on. Raises
+    DoraSystemdError; then nothing runs.
     """
     part = head.part()
     _check_part(part, request.start)
@@ -127,20 +128,20 @@ def start_member(manager: Manager, request: MemberRequest, head: Teller) -> sock
 
 
 def become_relay(runner: socket.socket) -> NoReturn:
-    """Have a small process carry what both say, for as long as the part lives."""
+    """Replace this process by a small one that passes lines as long as the part lives."""
     runner.setblocking(True)
     runner.set_inheritable(True)
     os.execv(sys.executable, relay_command(sys.executable, runner.fileno(), LEASE_SECONDS))
 
 
 def _check_part(part: Part, start: StartRequest) -> None:
-    """The head's doractl and its runner have to mean the same dataflow."""
+    """Raise DoraSystemdError unless the head's doractl and its runner name the same dataflow."""
     if (part.name, part.uuid, part.machine) != (start.name, start.uuid, start.machine):
         raise _refusal("the head's runner wants to run another dataflow than its doractl")
 
 
 def _check_forwards(part: Part) -> None:
-    """Nothing but sshd is open to the network, whatever GatewayPorts of sshd_config(5) says."""
+    """Raise DoraSystemdError if GatewayPorts of sshd_config(5) opens the ports to the network."""
     if is_open_beyond(part.coordinator):
         hint = "on that machine, in sshd_config: GatewayPorts no"
         raise _refusal("sshd there opens forwarded ports to the whole network", hint)
@@ -153,7 +154,7 @@ def _check_linger(scope: Scope) -> None:
 
 
 def _wait_for_address(request: MemberRequest, is_passing: bool) -> None:
-    """Return when this machine has its own one. It may be of a network that comes up late."""
+    """Wait until this machine has its address, whose network may come up late."""
     addresses, deadline = request.start.addresses, time.monotonic() + request.address_seconds
     while addresses and not is_own(addresses[0]):
         if time.monotonic() > deadline:
@@ -164,9 +165,9 @@ def _wait_for_address(request: MemberRequest, is_passing: bool) -> None:
 
 
 def _end_old_part(manager: Manager, request: MemberRequest) -> None:
-    """End a part of the same dataflow whose head has begun anew.
+    """End a part of the same dataflow whose head has started a new run.
 
-    One of a former start, with another UUID, ends by itself if its head is gone.
+    A part of a former start, with another UUID, ends by itself if its head is gone.
     """
     cell = read_cell(manager, request.unit)
     if cell is None or not cell.options.machine:
@@ -204,7 +205,7 @@ def _member_plan(plan: Plan, part: Part) -> Plan:
 def _check_same(part: Part, plan: Plan) -> None:
     """Raise DoraSystemdError unless both machines have the same file and the same doractl.
 
-    The runner asks dora for its version: root does not run it.
+    The runner checks the version of dora, which root must not execute.
     """
     if version_numbers(part.doractl)[:2] != version_numbers(__version__)[:2]:
         hint = "install the same version of dora-systemd on both machines"
@@ -251,7 +252,7 @@ def _first_answer(manager: Manager, unit: str, runner: socket.socket) -> bytes:
     line = _first_line(runner)
     if not line.endswith(b"\n"):
         while not _is_down(manager, unit) and time.monotonic() < deadline:
-            time.sleep(_LOOK_SECONDS)  # only then it says why
+            time.sleep(_LOOK_SECONDS)  # the unit has the reason only when it is down
         raise _failure(manager, unit)
     return line
 
@@ -282,9 +283,9 @@ def _refusal(reason: str, hint: str = "") -> DoraSystemdError:
 
 
 class Head:
-    """The head, by two file descriptors. Within its block it hears that this side is there.
+    """The connection to the head over two file descriptors. The context sends heartbeats.
 
-    line_seconds: for each line until the part: the head may just start, and have much else to do.
+    line_seconds: timeout of each line until the Part, because the head may be busy with its start.
     """
 
     line_seconds = 30.0
@@ -305,7 +306,7 @@ class Head:
         self._beats.join()
 
     def part(self) -> Part:
-        """What to run. Raises DoraSystemdError (FAILURE) if nobody says it."""
+        """Receive the Part. Raises DoraSystemdError (FAILURE) if the head sends none."""
         most = time.monotonic() + self.most_seconds
         while True:
             deadline = min(most, time.monotonic() + self.line_seconds)
@@ -317,11 +318,11 @@ class Head:
                 return expect(message, Part)
 
     def tell(self, message: Message) -> None:
-        """Say something, if the head is still there."""
+        """Send a message, if the head is still connected."""
         self.say(format_message(message))
 
     def say(self, line: bytes) -> None:
-        """Say a whole line."""
+        """Send a whole line, if the head is still connected."""
         with self._lock, suppress(OSError):
             os.write(self._writing, line)
 
@@ -332,10 +333,10 @@ class Head:
 
 
 def read_line(fd: int, deadline: float, most: int = MAX_LINE) -> bytes:
-    """One line, and not a byte more: what follows is for the relay.
+    """Read one line, and not a byte more: what follows is for the relay.
 
-    Without its end if nobody says more, or not before `deadline`, in seconds of the monotonic
-    clock, or after `most` bytes. Raises OSError.
+    The line has no end if the input ends, at `deadline` (seconds of the monotonic clock), or after
+    `most` bytes. Raises OSError.
     """
     line = b""
     while not line.endswith(b"\n") and len(line) < most:

@@ -1,4 +1,4 @@
-"""Asks a machine by ssh whether it can be a member, as its link would log in."""
+"""Checks by ssh whether a machine can be a member, with the login of its link."""
 
 import itertools
 import os
@@ -27,21 +27,24 @@ _MICROSECOND_NS = 1000
 
 
 class Probe(NamedTuple):
-    """What a machine has said. skew: µs that its clock is ahead of ours."""
+    """The description of a machine. skew: µs that its clock is ahead of ours."""
 
     facts: Facts
     skew: int
 
 
 def probe_as_caller(host: Host) -> Probe:
-    """With the keys of the caller; on a terminal ssh may ask. Raises DoraSystemdError (NO_HOST)."""
+    """Probe a machine with the caller's keys; ssh may prompt. Raises DoraSystemdError (NO_HOST)."""
     mark = _mark()
     arguments = ssh_arguments(host, Way.ONCE, remote_command(Way.ONCE, _FACTS, mark))
     return _probe(host, _asking(arguments), mark)
 
 
 def ask_as_caller(host: Host, words: Sequence[str]) -> str:
-    """What doractl there prints, with the keys of the caller. Raises DoraSystemdError (NO_HOST)."""
+    """Return the output of doractl on a host, with the caller's keys.
+
+    Raises DoraSystemdError (NO_HOST).
+    """
     mark = _mark()
     arguments = ssh_arguments(host, Way.ONCE, remote_command(Way.ONCE, words, mark))
     status, output, errors = _run(host, arguments)
@@ -52,7 +55,7 @@ def ask_as_caller(host: Host, words: Sequence[str]) -> str:
 
 
 def probe_as_link(host: Host, machine: str, identity: str) -> Probe:
-    """As the link to the machine does, with forwards. identity: its key, or "".
+    """Probe a machine with the login and the forwards of its link. identity: its key, or "".
 
     Raises DoraSystemdError (NO_HOST).
     """
@@ -76,7 +79,7 @@ def run_there(host: Host, script: str, *words: str) -> None:
 
 
 def _asking(arguments: Sequence[str]) -> list[str]:
-    """Without BatchMode: a person may be asked for a password, or about a host key."""
+    """Remove BatchMode, so that ssh may prompt for a password, or about a host key."""
     at = list(arguments).index("BatchMode=yes")
     return [*arguments[: at - 1], *arguments[at + 1 :]]
 
@@ -112,7 +115,7 @@ def _require(host: Host, mark: str, output: bytes, errors: bytes, status: int) -
 def _run(
     host: Host, arguments: Sequence[str], seconds: float = SECONDS
 ) -> tuple[int, bytes, bytes]:
-    """Exit status of ssh, and what came by it, in bounds: the machine may talk for ever."""
+    """Run ssh; return its exit status and bounded output, as the machine may send without limit."""
     pipe = subprocess.PIPE
     deadline = time.monotonic() + seconds
     with start_ssh(arguments, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe) as child:

@@ -29,7 +29,7 @@ from dora_systemd.verbs.machines.probe import ask_as_caller
 from dora_systemd.verbs.start.plan import Plan
 
 _SECONDS = 24 * 3600.0
-"""For a copy. ssh ends one that does not go on."""
+"""Timeout of a copy. ssh ends a copy that makes no progress."""
 _NONE = "rsync is not installed"
 
 
@@ -38,10 +38,10 @@ def push(
     stage: Callable[[str], None],
     ask: Callable[[Host, Sequence[str]], str] = ask_as_caller,
 ) -> None:
-    """Copy the directory of the dataflow to each member. stage: is told what happens.
+    """Copy the directory of the dataflow to each member. stage: receives each step.
 
-    ask: gives what doractl prints on a host. All machines are asked before the first copy. Raises
-    DoraSystemdError.
+    `ask`: returns the output of doractl on a host. All machines are checked before the first copy.
+    Raises DoraSystemdError.
     """
     dataflow = plan.options.dataflow
     if not plan.members:

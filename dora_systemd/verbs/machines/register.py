@@ -61,7 +61,7 @@ def known_machines(scope: Scope, environment: Mapping[str, str]) -> list[Known]:
 
 
 def chosen(machines: list[Known], names: tuple[str, ...]) -> list[Known]:
-    """Those with these names; all without names. Raises DoraSystemdError (NOT_FOUND)."""
+    """Return the machines with these names, or all. Raises DoraSystemdError (NOT_FOUND)."""
     by_name = {one.name: one for one in machines}
     for name in names:
         if name not in by_name:
@@ -71,7 +71,10 @@ def chosen(machines: list[Known], names: tuple[str, ...]) -> list[Known]:
 
 
 def check_machine(scope: Scope, machine: Known) -> tuple[Probe, list[tuple[str, str]]]:
-    """What a machine says, as its link logs in, and what is wrong. Raises DoraSystemdError."""
+    """Probe a machine with the login of its link; return the result and its problems.
+
+    Raises DoraSystemdError.
+    """
     probe = probe_as_link(machine.host, machine.name, machine.key)
     return probe, list(problems(own_facts(scope), probe.facts, probe.skew))
 
@@ -79,7 +82,7 @@ def check_machine(scope: Scope, machine: Known) -> tuple[Probe, list[tuple[str, 
 def add_machine(
     scope: Scope, environment: Mapping[str, str], host: Host, name: str
 ) -> Iterator[str]:
-    """Make a key, let it in over there, and declare the machine; yields what was done.
+    """Create a key, authorize it on the host, and declare the machine; yield each step done.
 
     Raises DoraSystemdError; then nothing is declared.
     """
@@ -193,7 +196,7 @@ _KEY_SECONDS = 30.0
 
 
 def make_key(place: Path, machine: str) -> Path:
-    """The key of a machine, which is there then. Raises DoraSystemdError."""
+    """Create the key of a machine, unless it exists; return its path. Raises DoraSystemdError."""
     path = place / machine
     if exists(path):
         return path

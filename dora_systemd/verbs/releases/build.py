@@ -60,7 +60,7 @@ _LIBEXEC = str(Path(__file__).parents[2] / "libexec/builds")
 _LOOK_SECONDS = 0.2
 _GONE_SECONDS = 20.0
 _LATE_SECONDS = 30.0
-"""After which systemd's own bound does not hold: the main process may ask for more."""
+"""Time after systemd's own timeout, which the main process may extend."""
 _VENV, _CACHE = "pyvenv.cfg", "CACHEDIR.TAG"
 """Files whose directory is a virtual environment, or a cache such as Cargo's `target`."""
 _HINT = "the build has left it: have the build remove it, or make something else of it"
@@ -76,7 +76,7 @@ class Build:
     """A build of a release of `source`.
 
     release, uuid: ids of the release and the dataflow. timeout: µs. on_line: gets the last line
-    of what the build has printed, "" before the first, each time that somebody looks.
+    of the build's output, "" before the first, at each check of the unit.
     """
 
     scope: Scope
@@ -99,7 +99,7 @@ class Build:
 
     @property
     def place(self) -> Path:
-        """Where its files will be, and where the build sees them already."""
+        """The final path of the release; the build runs with its files mounted there."""
         return self.store.tree(self.release)
 
 
@@ -107,10 +107,10 @@ class Build:
 def built_project(
     manager: Manager, build: Build, project: Project, found: Mapping[str, Found], tell: Tell
 ) -> Iterator[tuple[Project, dict[str, Found]]]:
-    """The project after its build, and the files that belong to its release.
+    """Build the project; yield it, and the files of its release.
 
-    found: those of the project. Raises DoraSystemdError (BAD_INPUT) for a build that fails or does
-    not end, or leaves what no release can have, and OSError.
+    found: files of the project. Raises DoraSystemdError (BAD_INPUT) for a build that fails, does
+    not end, or leaves a file that no release can have, and OSError.
     """
     user = build.source.plan.user
     tree = BuildTree(build.store)
@@ -164,21 +164,21 @@ def _start(manager: Manager, build: Build, tree: BuildTree, reading: int) -> Non
 
 @contextmanager
 def stopped_after_error(manager: Manager, unit: str) -> Iterator[None]:
-    """Stop a unit after an exception, also if systemd may or may not have got its start."""
+    """Stop a unit after an exception, whether or not systemd has received its start."""
     try:
         yield
     except BaseException:
-        # Whatever its state is: a start that is queued is replaced by that.
-        with suppress(DoraSystemdError):  # the first error is the one to tell
+        # In any state of the unit: the stop replaces a queued start.
+        with suppress(DoraSystemdError):  # the first error is the one to report
             manager.run_jobs("StopUnit", [unit])
         raise
 
 
 def end_former(manager: Manager, unit: str) -> None:
-    """Stop the build of a deploy that was killed: it notices that itself, unless it is hostile."""
+    """Stop the build of a killed deploy, which notices the kill itself unless it is hostile."""
     deadline = time.monotonic() + _GONE_SECONDS
     while time.monotonic() < deadline:
-        # A unit that systemd has been asked about is listed for a while, but not loaded.
+        # After a request for an unknown unit, systemd lists that unit for a while as not loaded.
         known = [one for one in manager.list_units(unit) if one.load == "loaded"]
         if not known:
             return
@@ -197,7 +197,8 @@ def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
         if is_at_rest(facts):
             return
         line = str(facts["StatusText"])
-        if line not in ("", told) and not line.startswith(FAILED_BECAUSE):  # an error tells that
+        # A line with FAILED_BECAUSE becomes an error at the end.
+        if line not in ("", told) and not line.startswith(FAILED_BECAUSE):
             told = line
         build.on_line(told)
         if build.timeout != INFINITY and time.monotonic() > deadline:

@@ -49,7 +49,8 @@ from dora_systemd.verbs.start.start import make_room
 class Change:
     """A release that is to run. text: its unit file. soak: µs. verb: "deploy" or "rollback".
 
-    how: what to do while a lock inhibits it. by: what asks for it, as in note_request().
+    how: what to do while a lock inhibits the change. by: the command that requests the change, as
+    in note_request().
     """
 
     release: str
@@ -102,7 +103,7 @@ def change_release(
 
 @dataclass(frozen=True)
 class _Attempt:
-    """A change of what stands. The fields are those of change_release()."""
+    """A change of the standing release. The fields are the arguments of change_release()."""
 
     manager: Manager
     scope: Scope
@@ -114,7 +115,7 @@ class _Attempt:
 def _try(attempt: _Attempt, store: Store, trial: Trial) -> None:
     manager, scope, tell = attempt.manager, attempt.scope, attempt.tell
     standing, change = attempt.standing, attempt.change
-    # After this nothing is certain but what the journal and systemd say: undo it in any case.
+    # After this only the journal and systemd know the state: undo the change in any case.
     mark, life = _Mark(store, change.release), read_life(manager, standing.boot.unit)
     begun = partial(_end_alone, scope, standing, change, life, mark)
     with guarded(begun, store.lock), _interruptible():
@@ -162,7 +163,7 @@ def _limit(options: RunnerOptions) -> int:
 
 
 class _Mark:
-    """The note that a release has passed its trial, which a commit that fails takes back."""
+    """The file that records a passed trial of a release; a failed commit removes it."""
 
     def __init__(self, store: Store, release: str) -> None:
         self.store = store
@@ -170,21 +171,21 @@ class _Mark:
         self._was_there = store.is_proved(release)
 
     def make(self) -> None:
-        """Make it. Raises DoraSystemdError."""
+        """Create the file. Raises DoraSystemdError."""
         try:
             self.store.prove(self._release)
         except OSError as error:
             raise unusable(self.store.release(self._release), error) from error
 
     def take_back(self) -> None:
-        """Remove it, unless it is from an earlier trial."""
+        """Remove the file, unless it is from an earlier trial."""
         if not self._was_there:
-            with suppress(OSError):  # the way back is worth more
+            with suppress(OSError):  # restoring the former release is more important
                 self.store.doubt(self._release)
 
 
 def _roll_back(attempt: _Attempt, fault: Fault, mark: _Mark) -> DoraSystemdError:
-    """Go back to what was there before; the error that tells it."""
+    """Restore the former release; return the error that reports that."""
     manager, standing, change = attempt.manager, attempt.standing, attempt.change
     mark.take_back()
     note_fault(mark.store, standing, change.release, fault, change.by)
@@ -200,7 +201,7 @@ def _roll_back(attempt: _Attempt, fault: Fault, mark: _Mark) -> DoraSystemdError
             now = f"{former or 'what was there before'} {_back(manager, standing, tell)}"
     except DoraSystemdError as error:
         now = f"the way back has failed, too: {error.message}"
-    # It belongs to the life that runs then.
+    # The event has the UUID of the life that runs after this.
     uuid, details = change.options.uuid, {"release": change.release, "former": former}
     reasons = {"nodes": fault.node, "reason": fault.reason}
     note_request(ROLLED_BACK, name, uuid, change.by, **details, **reasons)
@@ -213,16 +214,16 @@ def _roll_back(attempt: _Attempt, fault: Fault, mark: _Mark) -> DoraSystemdError
 
 
 def _end_alone(scope: Scope, standing: Standing, change: Change, life: str, mark: _Mark) -> None:
-    # The other's connection is of no use, see sd_bus_new(3).
+    # A bus connection does not survive fork(), see sd_bus_new(3).
     end_killed(Bus(scope), scope, standing, change, life, mark)
 
 
 def end_killed(
     manager: Manager, scope: Scope, standing: Standing, change: Change, life: str, mark: _Mark
 ) -> None:
-    """Go back after this process was killed, unless the release was committed before that.
+    """Restore the former release after this process was killed, unless the new one is committed.
 
-    life: of the unit before the trial. What has not been touched goes on.
+    life: of the unit before the trial. A unit that the trial has not restarted keeps running.
     """
     unit = standing.boot.unit
     now = read_standing(manager, scope, unit)
@@ -233,14 +234,14 @@ def end_killed(
         return
     if read_life(manager, unit) == life:
         end_trial(manager, standing)
-    # Once more: a restart may have been on its way.
+    # Check again: a restart may have been queued.
     if read_life(manager, unit) != life:
         attempt = _Attempt(manager, scope, standing, change, lambda _: None)
         _roll_back(attempt, Fault(KILLED, is_outside=True), mark)
 
 
 def _note_stop(manager: Manager, change: Change) -> None:
-    """Note who stops the release on trial, if that still runs."""
+    """Record who stops the release on trial, if that release still runs."""
     with suppress(DoraSystemdError):
         state = manager.read(unit_name(change.options.name), ["ActiveState"])["ActiveState"]
         if state in UP:
@@ -248,7 +249,7 @@ def _note_stop(manager: Manager, change: Change) -> None:
 
 
 def _calm(tell: Tell) -> Tell:
-    """Tell without an end of what is done: neither a commit nor the way back stops for that."""
+    """Wrap `tell` so that its exceptions stop neither a commit nor the way back."""
 
     def tell_on(step: Step) -> None:
         with suppress(Exception):
@@ -258,7 +259,7 @@ def _calm(tell: Tell) -> Tell:
 
 
 def stop_observer(tell: Tell) -> Observer:
-    """Tells that a way back lasts, while the release on trial is stopped."""
+    """Return an observer that reports the stop of the release on trial during the way back."""
     told = _calm(tell)
 
     def observe(changes: Mapping[str, Any]) -> None:
@@ -270,7 +271,7 @@ def stop_observer(tell: Tell) -> Observer:
 
 
 def _back(manager: Manager, standing: Standing, tell: Tell) -> str:
-    """Whether the unit is up again, in words."""
+    """Format whether the unit is up again."""
 
     def observe(active: str, status: str) -> None:
         tell(going_back(standing.current, status if active == "activating" else ""))
@@ -306,5 +307,5 @@ def _ignore_signals() -> None:
 
 
 def _takes_signals() -> bool:
-    """Only the main thread can; those of the gateway are told by `tell`, which raises."""
+    """Whether this is the main thread; in threads of the gateway, `tell` raises instead."""
     return threading.current_thread() is threading.main_thread()

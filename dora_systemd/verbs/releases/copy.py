@@ -32,7 +32,7 @@ _MICROSECOND_NS = 1000
 class Copied(NamedTuple):
     """A copied project. copied: bytes of its files that the last release does not have.
 
-    notes: what people have to know about the last release.
+    notes: warnings about the last release (human-readable).
     """
 
     manifest: Manifest
@@ -51,7 +51,7 @@ def newest(store: Store) -> Manifest | None:
 
 
 def repository_owners(source: Source) -> list[int]:
-    """Whose repositories git may read: root's, and those of the user that reads."""
+    """Return the users whose repositories git may read: root, and the user that reads."""
     user = source.plan.user
     return [0, os.geteuid() if user is None else user.pw_uid]
 
@@ -67,8 +67,8 @@ def copy_project(
 ) -> Copied:
     """Copy the project of `source`. build_timeout: µs.
 
-    Raises DoraSystemdError (BAD_INPUT) for a file that no release can have, and for a build that
-    fails; then nothing is left.
+    Raises DoraSystemdError (BAD_INPUT) for a file that no release can have, and for a failed build;
+    then no part of the copy stays.
     """
     user = source.plan.user
     last = newest(store)
@@ -114,7 +114,7 @@ def _damage(last: Manifest | None, paths: Sequence[str]) -> Iterator[str]:
 
 
 def _lacking(found: dict[str, Found], last: Manifest | None) -> int:
-    """The bytes that the last release lacks, as far as their size tells; some may be sparse."""
+    """Estimate the bytes that the last release lacks, by sizes; some files may be sparse."""
     old = last.files if last else {}
     sizes = (
         one.size for path, one in found.items() if path not in old or old[path].size != one.size

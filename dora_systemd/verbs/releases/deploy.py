@@ -118,7 +118,7 @@ def _manifest_of(store: Store, standing: Standing) -> Manifest | None:
 
 @dataclass(frozen=True)
 class _Deploy:
-    """A deploy under way. The fields are those of deploy()."""
+    """A deploy under way. The fields are the arguments of deploy()."""
 
     manager: Manager
     scope: Scope
@@ -137,7 +137,7 @@ def deploy(
     warn: Callable[[str], None],
     source: Source | None = None,
 ) -> Deployed:
-    """Deploy a project. tell: gets each step; warn: each warning. source: it, if that is known.
+    """Deploy a project. `tell`: gets each step; warn: each warning. source: the project, if known.
 
     Raises DoraSystemdError: ROLLED_BACK if the release has failed its trial. After any other error
     everything is as before.
@@ -267,7 +267,7 @@ def _lost_note(former: Manifest | None, request: StartRequest, source: Source) -
 def _at_source(
     error: DoraSystemdError, store: Store, release: str, source: Source
 ) -> DoraSystemdError:
-    """The error with the paths of the project: those of the copy are gone."""
+    """Return the error with paths of the project instead of those of the removed copy."""
     tree = str(store.tree(release))
     message, hint = (text.replace(tree, source.root) for text in (error.message, error.hint))
     if source.dora and "doractl build" in hint:
@@ -319,7 +319,7 @@ def _has_files_of(source: Source, manifest: Manifest) -> bool:
     known = of_project(manifest.files)
     with opened_project(source.root, account_of(source.plan.user)) as project:
         found, _ = find_files(project, source.named, repository_owners(source))
-        # The content is read last, and only if all else is the same.
+        # The content is compared last, and only if everything else is equal.
         is_alike = found.keys() == known.keys() and all(
             _is_alike(one, known[path]) for path, one in found.items()
         )

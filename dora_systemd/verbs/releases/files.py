@@ -1,7 +1,7 @@
 """Finds the files of a project that belong to a release, and copies them.
 
-They are those that git would track; without git, all but what .gitignore and the first rules of hot
-reload leave out. Whatever the dataflow itself names belongs to them in any case.
+A release has the files that git would track; without git, all but those that .gitignore and the
+first rules of hot reload leave out. A release has in any case the files that the dataflow names.
 """
 
 import errno
@@ -26,7 +26,7 @@ from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT
 from dora_systemd.trust.project import Project
 
 Progress = Callable[[int, int], None]
-"""Called with the bytes that are done, and those of all files."""
+"""Called with the bytes that are copied, and those of all files."""
 Count = Callable[[int], None]
 """Called with the bytes of one file that are read."""
 
@@ -38,14 +38,14 @@ class Target(Protocol):
         """Write a file."""
 
     def share(self, path: str, release_id: str, stored: Stored) -> bool:
-        """Take the file with the same path in another release, if it is as it was stored."""
+        """Share the file with the same path in another release, if it is unchanged."""
 
     def link(self, path: str, target: str) -> Stored:
         """Create a symbolic link."""
 
 
 _MOST_LINKS = 40
-"""As in Linux, see path_resolution(7)."""
+"""Maximum links in a path, as in Linux, see path_resolution(7)."""
 _POINTER, _MOST_POINTER = b"version https://git-lfs.github.com/spec/", 1024
 """How a pointer of Git LFS begins, and the maximum bytes of one."""
 _AGAIN = "wait until nothing writes to the project, then deploy again"
@@ -90,7 +90,7 @@ def _of_git(project: Project, names: Sequence[str]) -> dict[str, Found]:
 
 
 def _below(project: Project, paths: Sequence[str]) -> dict[str, Found]:
-    """The files with these paths, as far as they exist, and those of directories."""
+    """Find the existing files with these paths, and all files below directories among them."""
     found: dict[str, Found] = {}
     for one in _existing(project, list(dict.fromkeys(paths))):
         found |= _walk(project, one.path) if one.kind == DIRECTORY else {one.path: one}
@@ -98,7 +98,7 @@ def _below(project: Project, paths: Sequence[str]) -> dict[str, Found]:
 
 
 def _real(path: str, found: Mapping[str, Found]) -> str:
-    """Where links of the release lead to; "" if that is not in the project.
+    """Resolve links of the release in a path; "" if the result is not in the project.
 
     A release cannot have a link and, with the same name, a directory.
     """

@@ -119,7 +119,7 @@ def _judge(manager: Manager, scope: Scope, name: str) -> Iterator[Finding]:
 def refuse_on_trial(scope: Scope, cell: Cell, verb: str) -> None:
     """Raise DoraSystemdError if a deploy or rollback tries a release of the dataflow now.
 
-    What it commits, or goes back to, would undo half of what `verb` does to the unit.
+    The commit or the way back of that trial would undo half of what `verb` does to the unit.
     """
     options = trial_options(scope, cell.unit)
     if options and is_locked(store_of(scope, cell.name)):

@@ -76,9 +76,9 @@ def receive(
     tell: Tell,
     warn: Warn,
 ) -> Deployed:
-    """Deploy the project that comes by `stream`; when that ends, the trial does, and is undone.
+    """Deploy the project that arrives by `stream`; at the end of `stream` undo the trial.
 
-    answer: gets the line that says which contents to send. tell, warn: as of deploy(). Raises
+    answer: gets the line that lists the contents to send. `tell`, warn: as of deploy(). Raises
     DoraSystemdError, as deploy().
     """
     parcel = parse_parcel(stream.line(MOST_HEAD))
@@ -188,16 +188,16 @@ def _source(
     user = choose_user(scope, wanted, files.place, str(directory))
     draft.lend(None if user is None else user.pw_gid)
     source = find_source(scope, start, bool(request.build_timeout))
-    # All that was sent, whatever the rules about files here say.
+    # All files that were sent, whatever the rules about files on this host are.
     named = tuple(parcel.files)
     sent = parcel.source or "standard input"
     return replace(source, named=named, sent=sent, revision=parcel.revision), start
 
 
 def _require_user(scope: Scope, parcel: Parcel, source: Source) -> None:
-    """Raise DoraSystemdError (NO_PERMISSION) for a project of another user that sends root.
+    """Raise DoraSystemdError (NO_PERMISSION) for another user's project that root sends.
 
-    Here that user's code would run as the user of all of root's dataflows.
+    On this host that user's code would run as the user of all of root's dataflows.
     """
     user = source.plan.user
     if scope.is_user or user is None or not parcel.owner or source.plan.settings.is_given(USER):

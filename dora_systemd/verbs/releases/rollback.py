@@ -107,7 +107,7 @@ def _require_intact(store: Store, manifest: Manifest) -> None:
 
 
 def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell: Tell) -> Deployed:
-    """End the trial of a release that has none before it: what was there before runs again."""
+    """End the trial of the first release, and run again what ran before that release."""
     for cell in standing.running:
         note_request("stop-asked", cell.name, cell.uuid, by)
     note_fault(store, standing, standing.trial, Fault(KILLED, is_outside=True), by)
@@ -131,7 +131,7 @@ def _choose(store: Store, standing: Standing, release: str | None) -> str:
 
 
 def _before(store: Store, standing: Standing) -> str:
-    """The release that ran well before the present one; never one that somebody went back from."""
+    """Return the release that ran well before the present one; never one rolled back from."""
     past, current = read_past(store, standing.current), standing.current
     if chosen := before(store.known(), current, past):
         return chosen

@@ -44,9 +44,9 @@ class Packed(NamedTuple):
 
 
 class Sender(NamedTuple):
-    """A project here. directory: its working directory, "" for that of the dataflow file.
+    """A project to send. directory: its working directory, "" for that of the dataflow file.
 
-    beside: what the settings file beside that says, None without one.
+    `beside`: the content of the settings file next to the dataflow file, None without one.
     """
 
     place: Place
@@ -64,10 +64,10 @@ def packed(
     warn: Callable[[str], None],
     find_reader: Callable[[Sender], Account | None] | None = None,
 ) -> Iterator[Packed]:
-    """The project that `request` names, which nobody changes any more.
+    """Pack a copy of the project that `request` names.
 
-    tell: gets each stage; warn: each warning. find_reader: gives the account that reads it. Raises
-    DoraSystemdError.
+    `tell`: gets each stage; warn: each warning. find_reader: returns the account that reads the
+    project. Raises DoraSystemdError.
     """
     sender = _find(request)
     if note := _venv_note(sender):
@@ -117,12 +117,12 @@ def _find(request: StartRequest) -> Sender:
 
 
 def _require_trusted(read: SettingsFile) -> None:
-    """Refuse settings by which another user would get the rights of the login over there."""
+    """Refuse settings by which another user would get the rights of the login on the host."""
     caller = os.geteuid()
     if read.is_roots or (caller and not read.place.borrowed and read.place.uid == caller):
         return
     require_modest(read)
-    # Here its owner reads them, over there whoever logs in.
+    # On this machine the owner of the file reads these files, on the host the user who logs in.
     for file in resolve_settings({}, {}, [(f"{_NO_PLACE}/x.yml", read.document)])[ENV_FILE]:
         if not os.path.normpath(file).startswith(f"{_NO_PLACE}/"):
             message = f"cannot send {shown(str(read.path))}: env_file is not in the project"
@@ -174,7 +174,7 @@ def _reader(sender: Sender) -> Account | None:
 
 
 def _foreign_owner(sender: Sender) -> str:
-    """The owner of the dataflow file, "" for root and the caller: both may decide over there."""
+    """Return the owner of the dataflow file, "" for root and the caller, whom the host trusts."""
     uid = sender.place.uid
     return "" if uid in (0, os.geteuid()) else user_name(uid)
 

@@ -1,7 +1,7 @@
 """The gate of a release: it starts, and then runs for a while without a fault.
 
-With Restart=always a bad version never reads "failed", and dora restarts nodes by itself. So the
-journal tells as well: every crash and restart of a node is an event there.
+With Restart=always a bad version never becomes "failed", and dora restarts nodes by itself. So the
+gate reads the journal, too, where every crash and restart of a node is an event.
 """
 
 import time
@@ -46,10 +46,10 @@ def settle(
     tell: Callable[[str, str], None],
     is_over: Callable[[], bool] = bool,
 ) -> str:
-    """Wait until a unit that has a job to start is up or down: its ActiveState, or LATE.
+    """Wait until a unit with a start job is up or down; return its ActiveState, or LATE.
 
-    A unit that systemd is about to start again has failed. limit: µs. tell: gets its ActiveState
-    and its status text, again and again. is_over: whether to wait no longer. Raises
+    A unit that systemd is about to restart has failed. limit: µs. `tell`: gets the ActiveState and
+    the status text of the unit at each check. is_over: whether to wait no longer. Raises
     DoraSystemdError.
     """
     deadline = time.monotonic() + limit / SECOND
@@ -67,10 +67,10 @@ def settle(
 
 
 class Gate:
-    """The trial of a dataflow. options: of the release. tell: gets each step.
+    """The trial of a dataflow. options: of the release. `tell`: gets each step.
 
-    hear: as read_heard(). may_wait: nodes may wait for what they need, and nobody then waits for
-    what nodes owe.
+    `hear`: as read_heard(). may_wait: whether nodes may wait for what they need; then the trial
+    does not wait for owed outputs.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Gate:
     def run(self, start_limit: int, soak: int) -> Fault | None:
         """Restart the unit, and watch it for `soak` µs after its nodes are ready.
 
-        Longer, until each output that a node owes has come: one that never comes would pass.
+        Watches longer, until each owed output has arrived: a missing output would pass else.
         start_limit: µs until the nodes are ready. None if all is well. Raises DoraSystemdError.
         """
         with suppress(DoraSystemdError):  # systemd does not know a new unit
@@ -128,9 +128,9 @@ class Gate:
         return self._end(state)
 
     def _has_failed(self) -> bool:
-        """Whether a node has failed; looks once a second.
+        """Return whether a node has failed; checks once a second.
 
-        With a restart policy of its own it would be started again and again, until the limit.
+        dora would restart a node with a restart policy again and again, until the limit.
         """
         if time.monotonic() < self._looked + _LOOK_SECONDS:
             return False

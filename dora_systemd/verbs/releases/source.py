@@ -26,13 +26,13 @@ from dora_systemd.verbs.start.where import account_of, find_uv
 
 @dataclass(frozen=True)
 class Source:
-    """A project. root: its directory. origin: of its files, whose owner decides what they may say.
+    """A project. root: its directory. origin: of its files, whose owner limits their settings.
 
-    plan: of a start from there. named: files that the dataflow names, relative to root. read: what
-    the files say that decide what root does, None for one that is not there. dora, uv: the commands
-    that have something to build, "" otherwise. is_moving: these may build another program from
-    the same files. sent: from where another host has sent it, or "". revision: of git, for one that
-    was sent.
+    plan: of a start from root. named: files that the dataflow names, relative to root. read: the
+    contents of files that decide what root does, None for a missing file. dora, uv: the commands
+    that have something to build, "" otherwise. is_moving: whether these may build another program
+    from the same files. sent: from where another host has sent the project, or "". revision: of
+    git, for a project that was sent.
     """
 
     root: str
@@ -115,14 +115,14 @@ def named_paths(
 
 
 def require_same(source: Source, tree: Path) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) if the copy says other things than its owner does.
+    """Raise DoraSystemdError (BAD_INPUT) if the copy differs from the files that root has read.
 
-    The user of the nodes has read it for root, and can lie about files that are not that user's.
+    The user of the nodes has read the project for root, and can forge files of other users.
     """
     for path, data in source.read.items():
         copy = tree / path
         text = read_file(copy) if os.path.lexists(copy) else None
-        # A build may have put a link there, to what its user can change later.
+        # A build may have replaced the file by a link to a file that its user can change later.
         is_ours = text is None or text.place.is_roots or os.geteuid() != 0
         if (text and text.data) != data or not is_ours:
             hint = "deploy again; a build must not change it"
@@ -262,7 +262,7 @@ def find_builders(plan: Plan, dataflow: Dataflow, root: str) -> tuple[str, str]:
 
 
 def _has_builds(directory: Path, module: object, sight: Sight) -> bool:
-    """Whether the file of a module asks for a build; dora reports one that is not readable."""
+    """Whether the file of a module requires a build; dora reports a file that is not readable."""
     path = directory / str(module)
     try:
         return has_builds(parse_yaml(decoded(sight.read(str(path)), path), path))

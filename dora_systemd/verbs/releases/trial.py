@@ -1,9 +1,9 @@
 """The unit files of a release on trial, of its commit, and of the way back.
 
 The trial's unit file is in /run/systemd/system.control, see UnitPath in systemd.unit(5): it has
-precedence over the one in /etc, which stays as it is, and a reboot removes it. So whatever happens
-in a trial, the machine boots what has proved itself. read_past() and note_run() are
-about the history of what ran, which is beside the releases.
+precedence over the one in /etc, which stays as it is, and a reboot removes the trial's file. So
+whatever happens in a trial, the machine boots the release that has passed one. read_past() and
+note_run() are about the history of releases that ran, a file next to the releases.
 """
 
 import time
@@ -49,10 +49,10 @@ KILLED = "the command that tried it was killed"
 
 @dataclass(frozen=True)
 class Standing:
-    """What there is of a dataflow before its release changes.
+    """The state of a dataflow before its release changes.
 
-    boot: its unit file. path: where that of a trial is. trial: the release on trial, or "". cell:
-    what systemd has loaded. has_trial: whether the file of a trial was there.
+    boot: its unit file. path: of the unit file of a trial. trial: the release on trial, or "".
+    cell: the loaded dataflow, or None. has_trial: whether the file of a trial exists.
     """
 
     boot: BootUnit
@@ -63,7 +63,7 @@ class Standing:
 
     @property
     def current(self) -> str:
-        """The release that every start runs without that of the trial, or ""."""
+        """The release that a start runs after the trial's unit file is removed, or ""."""
         known = self.boot.options
         if known is None and self.cell is not None and not self.has_trial:
             known = self.cell.options  # disabled while it ran
@@ -71,7 +71,7 @@ class Standing:
 
     @property
     def has_base(self) -> bool:
-        """Whether there is a unit file without that of the trial."""
+        """Whether there is a unit file besides that of the trial."""
         return self.boot.text is not None or self.boot.runtime.exists()
 
     @property
@@ -103,7 +103,7 @@ def read_standing(manager: Manager, scope: Scope, unit: str) -> Standing:
     boot, path = read_boot_unit(manager, scope, unit), trial_path(scope, unit)
     standing = Standing(boot, path, "", read_cell(manager, unit), path.exists())
     trial = release_of(options.dataflow) if options else ""
-    # A deploy that was killed right after its commit has left the same text in both places.
+    # A deploy that was killed right after its commit has left equal files in both directories.
     return standing if trial == standing.current else replace(standing, trial=trial)
 
 
@@ -122,17 +122,17 @@ def require_deployable(manager: Manager, scope: Scope, standing: Standing) -> No
 
 
 def read_deployable(manager: Manager, scope: Scope, unit: str) -> Standing:
-    """As read_standing(), and require_deployable()."""
+    """Read the Standing of a unit, and check require_deployable()."""
     standing = read_standing(manager, scope, unit)
     require_deployable(manager, scope, standing)
     return standing
 
 
 def read_after_wait(manager: Manager, scope: Scope, before: Standing, verb: str) -> Standing:
-    """What there is after a wait for locks of what ran `before`.
+    """Read the Standing after a wait for locks of the dataflows that ran `before`.
 
-    Raises DoraSystemdError: NOT_RUNNING if that has ended or somebody stops it, for the verb would
-    start it again; NAME_IN_USE for what a deploy must not replace.
+    Raises DoraSystemdError: NOT_RUNNING for a dataflow that has ended or is being stopped, because
+    the verb would start it again; NAME_IN_USE for a unit that a deploy must not replace.
     """
     for cell in before.running:
         now = next(iter(manager.list_units(cell.unit)), None)
@@ -146,13 +146,13 @@ def read_after_wait(manager: Manager, scope: Scope, before: Standing, verb: str)
 
 
 def begin_trial(manager: Manager, standing: Standing, text: str) -> None:
-    """Let the next start of the unit be that of the release. Raises DoraSystemdError."""
+    """Make the next start of the unit run the release. Raises DoraSystemdError."""
     write_unit_file(standing.path, text)
     _reload(manager)
 
 
 def commit(manager: Manager, standing: Standing, text: str, want_boot: bool) -> None:
-    """Let the release be what every start runs: a rename on the disk decides.
+    """Make every start run the release, by a rename on the disk.
 
     want_boot: enable it as well, unless it is. Raises DoraSystemdError; then nothing has changed.
     """
@@ -177,7 +177,7 @@ def go_back(
     DoraSystemdError.
     """
     unit = standing.boot.unit
-    # The trial ends first: a stop can take longer than whoever waits for it lives. But a unit
+    # The trial ends first, because this process may be killed during a long stop. But a unit
     # without any other file would lose what its stop needs.
     if standing.has_base:
         end_trial(manager, standing)
@@ -220,14 +220,14 @@ def read_past(store: Store, current: str) -> list[Switch]:
 
 
 def note_run(store: Store, standing: Standing, release: str, by: str) -> None:
-    """Note that a release has passed its trial. standing: of before. by: as in note_request()."""
+    """Record a passed trial. standing: before the trial. by: as in note_request()."""
     with suppress(DoraSystemdError):
         if _last(store) != release:
             _record(store, standing, [*_begun(store, standing, release, requester(by))])
 
 
 def note_fault(store: Store, standing: Standing, release: str, fault: Fault, by: str) -> None:
-    """Note that a trial has ended with a fault. Arguments as of note_run()."""
+    """Record that a trial has ended with a fault. Arguments as of note_run()."""
     with suppress(DoraSystemdError):
         last = next(reversed(store.history()), None)
         is_noted = last and last.former == release and last.how in (FAILED, INTERRUPTED)
@@ -239,7 +239,7 @@ def note_fault(store: Store, standing: Standing, release: str, fault: Fault, by:
 
 
 def note_removal(store: Store, standing: Standing, release: str, by: str) -> None:
-    """Note that a release was removed from the store, which is not what runs."""
+    """Record that a release that does not run was removed from the store."""
     switch = (release, standing.current, REMOVED, requester(by))
     _record(store, standing, [Switch(_now_us(), *switch)])
 

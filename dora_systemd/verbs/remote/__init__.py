@@ -1,4 +1,4 @@
-"""-H: which hosts, and the connections with them.
+"""-H: the hosts, and the connections to them.
 
-`talk.py` runs ssh(1) to all hosts at the same time, with a bound for each step.
+`talk.py` runs ssh(1) to all hosts in parallel, with a timeout for each step.
 """

@@ -1,7 +1,8 @@
 """`start --attach` of a dataflow on several machines: the lines of its nodes on the others, too.
 
-Each machine is asked for its own journal, by ssh, and again as long as the dataflow runs: a machine
-that is away is said once, and the others go on. A machine is believed for its own nodes only.
+Each machine sends its own journal by ssh, with a new connection after each loss as long as the
+dataflow runs. An unreachable machine is reported once, and does not stop the others. Of a machine
+only records of its own nodes count.
 """
 
 import select
@@ -22,7 +23,7 @@ _PAUSES = (0.5, 5.0)
 _TURNS = 16
 """Reads at one look: a flood of lines must not keep the caller here."""
 _LAST_SECONDS, _QUIET_SECONDS, _LOOK_SECONDS = 2.0, 0.7, 0.05
-"""For the last lines of a dataflow that has ended, and the silence after which there are none."""
+"""Time for the last lines of an ended dataflow, and the silence after which none are expected."""
 _EARLIER = 1_000_000
 """µs: clocks of machines differ."""
 
@@ -30,7 +31,7 @@ _EARLIER = 1_000_000
 class MemberLines:
     """The lines of the nodes of one machine, from `since_us` (CLOCK_REALTIME) on.
 
-    warn: is told once why there are none. pauses: as _PAUSES.
+    warn: called once with the reason if there are no lines. pauses: as _PAUSES.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class MemberLines:
         self._due, self._has_warned = 0.0, False
 
     def look(self) -> Iterator[Record]:
-        """The lines that have come; never waits."""
+        """Yield the received lines, without waiting."""
         if self._talk is None:
             if time.monotonic() >= self._due:
                 self._begin()
@@ -127,7 +128,7 @@ def _is_over(pidfd: int) -> bool:
 class SharedLog:
     """The lines of the head, and those of its members; as FollowedLog.
 
-    others: what comes from the members; they are known when the unit has been started.
+    others: the lines of the members, which are known when the unit has been started.
     """
 
     def __init__(
@@ -137,11 +138,11 @@ class SharedLog:
         self.others: Sequence[MemberLines] = ()
 
     def fileno(self) -> int:
-        """That of the head: who polls it looks at the others now and then."""
+        """Return the descriptor of the head's lines: a poller checks the others periodically."""
         return self._head.fileno()
 
     def print_new(self) -> None:
-        """Write some of the lines that have come."""
+        """Write some of the received lines."""
         self._head.print_new()
         self._look()
 

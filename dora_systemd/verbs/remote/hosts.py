@@ -1,4 +1,4 @@
-"""The hosts that -H means: those of the command line, or of a hosts file."""
+"""The hosts of -H: from the command line, or from a hosts file."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -43,7 +43,7 @@ def host_files(environment: Mapping[str, str]) -> list[Path]:
 
 
 def _read(path: Path) -> str:
-    """Its text. Root logs in where only root has said so."""
+    """Read the hosts file. root logs in only to hosts that a file of root lists."""
     text = read_file(path)
     if os.geteuid() == 0 and (reason := text.place.changeable):
         instead = f"name the hosts on the command line, or list them in {SYSTEM_HOSTS}"

@@ -1,7 +1,7 @@
-"""Runs doractl on hosts by ssh, at the same time: what they say, and how each one ends.
+"""Runs doractl on hosts by ssh, in parallel: yields its output and its end on each host.
 
-No host can hold up the others, or this process: a login, an answer and an idle connection have
-their bounds.
+No host can delay the others, or this process: a login, an answer and an idle connection have
+timeouts.
 """
 
 import itertools
@@ -19,15 +19,15 @@ from dora_systemd.decisions.remote.stream import AfterMark
 from dora_systemd.errors import DoraSystemdError
 
 LOGINS = 8
-"""At the same time: sshd drops connections if more than ten have not logged in, MaxStartups in
-sshd_config(5)."""
+"""Maximum logins in parallel: sshd drops connections if more than ten have not logged in, see
+MaxStartups in sshd_config(5)."""
 LOGIN_SECONDS = 15.0
 ANSWER_SECONDS = 90.0
-"""For verbs that only look; each of them has shorter bounds of its own."""
+"""Timeout of verbs that only read; each of these verbs has shorter timeouts of its own."""
 SHORT_SECONDS = 15.0
-"""For `list`, which asks systemd alone: one host that hangs must not hold back the table."""
+"""Timeout of `list`, which only queries systemd: a host that hangs must not delay the table."""
 AGAIN_SECONDS = 5.0
-"""Before each attempt to follow a host again that was lost."""
+"""Pause before each attempt to follow a lost host again."""
 _TURN_SECONDS = 0.2
 _COMPLAINT = 4096
 
@@ -90,17 +90,17 @@ class Talk:
 
     @property
     def is_in(self) -> bool:
-        """Whether doractl has begun over there."""
+        """Whether doractl has begun on the host."""
         return self._output.is_open
 
     def open_fds(self, is_full: bool) -> set[int]:
-        """What poll(2) has to look at. is_full: its output can wait."""
+        """Return the descriptors for poll(2). is_full: whether the host's output can wait."""
         connection = self.connection
         wanted = {connection.errors, connection.ended, *(() if is_full else (connection.output,))}
         return wanted - self._at_end
 
     def take(self, fd: int) -> list[Said] | None:
-        """What `fd` has to say now; None if there is nothing to read."""
+        """Read what `fd` has now; None if there is nothing to read."""
         data = self.connection.read(fd)
         if not data:
             self._at_end |= {fd} if data is not None else set()
@@ -122,27 +122,27 @@ class Talk:
 
     @property
     def wants_to_write(self) -> bool:
-        """Whether there is something to say, to a host that hears it."""
+        """Whether there is data to write, and the host accepts data."""
         return self._has_more and self.is_in and self.connection.input >= 0
 
     def say(self, chunks: Iterable[bytes]) -> None:
-        """Write this, too."""
+        """Append chunks to the data to write."""
         self._outbox = itertools.chain(self._outbox, chunks)
         self._has_more = True
 
     def write(self) -> None:
-        """Write what goes now."""
+        """Write without waiting as much as ssh accepts."""
         try:
             self._chunk = self._chunk or next(self._outbox)
             written = self.connection.write(self._chunk)
             self._chunk = self._chunk[written:]
             if written:
                 self._note_life()
-        except (OSError, StopIteration):  # who does not read any more says why
+        except (OSError, StopIteration):  # ssh closed its input; its stderr has the reason
             self._has_more = False
 
     def end(self) -> Iterator[Said | Ended]:
-        """What is left, after the end of ssh."""
+        """Yield the rest of the output, and the end, after ssh has ended."""
         for fd in (self.connection.output, self.connection.errors):
             while fd not in self._at_end and (said := self.take(fd)) is not None:
                 yield from said
@@ -161,7 +161,7 @@ class Talk:
         return self._refusal is not None or now > self._deadline
 
     def give_up(self) -> Ended:
-        """End a talk that has reached a bound."""
+        """End a connection that has reached a timeout."""
         status = self.connection.close()
         if self._refusal:
             return Ended(self.host, status, self._refusal, self.is_in)
@@ -174,10 +174,9 @@ class Talk:
 
 
 class Talks:
-    """The talks with several hosts. is_full: whether the output of a host can wait.
+    """The connections to several hosts. is_full: whether the output of a host can wait.
 
-    at_once: with how many at the same time. opening: what each of them reads first. silence: as of
-    Talk.
+    at_once: how many in parallel. opening: the first input of each host. silence: as of Talk.
     """
 
     def __init__(
@@ -208,39 +207,39 @@ class Talks:
 
     @property
     def present(self) -> list[Host]:
-        """The hosts that are talked with now."""
+        """The hosts with a connection now."""
         return [one.host for one in self._live]
 
     def say(self, host: Host, chunks: Iterable[bytes]) -> None:
-        """Let a host read this."""
+        """Send chunks to a host."""
         for one in self._live:
             if one.host == host:
                 one.say(chunks)
 
     def begin_again(self, host: Host, words: Sequence[str]) -> None:
-        """Talk with a host again that was lost, in a while, with these words."""
+        """Connect to a lost host again, after AGAIN_SECONDS, with this command."""
         self._lost.add(host)
         self._again[host] = time.monotonic() + AGAIN_SECONDS, words
 
     def begin_no_more(self) -> None:
-        """Talk with no host that is still waiting."""
+        """Drop the hosts that still wait for their turn."""
         self._waiting.clear()
         self._again.clear()
 
     def hang_up(self) -> None:
-        """End what follows, and let it say its last words."""
+        """Close the input of following commands, so that they end after their last output."""
         self.begin_no_more()
         for one in self._live:
             one.connection.hang_up()
 
     def give_up(self, host: Host, error: DoraSystemdError) -> None:
-        """End the talk with a host, with this error."""
+        """End the connection to a host, with this error."""
         for one in self._live:
             if one.host == host:
                 one.refuse(error)
 
     def events(self) -> Iterator[Event]:
-        """What happens, until all have ended. Raises DoraSystemdError if there is no ssh."""
+        """Yield all events until all hosts have ended. Raises DoraSystemdError without ssh."""
         try:
             while self._waiting or self._live or self._again:
                 self._admit()

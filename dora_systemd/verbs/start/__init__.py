@@ -1,6 +1,6 @@
 """`doractl start` is a line of stages, each a module and a value that the later ones use.
 
-    request      what is asked for             StartRequest
+    request      what is to start, and how     StartRequest
     read         the files, and whose          Files
     settings     which value counts            Settings
     where        who runs it, and from where   Where

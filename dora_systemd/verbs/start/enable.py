@@ -216,7 +216,7 @@ def install_unit_file(
 
 
 def _no_link(unit: str) -> DoraSystemdError:
-    """systemd says "not found" if it cannot create the directory of the link."""
+    """The error for "not found" of systemd, which cannot create the directory of the link."""
     hint = f"is there room on the disk? see systemctl enable {unit}"
     return DoraSystemdError(f"cannot enable {unit}: systemd made no link to it", hint)
 
@@ -266,8 +266,8 @@ def remove_files(manager: Manager, paths: Sequence[Path]) -> None:
 def release_transient(manager: Manager, boot: BootUnit) -> None:
     """Have systemd unload an ended transient unit, so that the enabled file takes effect.
 
-    systemd unloads it, with its fragment, only while no target wants it: drop the link for a
-    moment.
+    systemd unloads the unit, with its fragment, only while no target wants the unit: drop the link
+    for a moment.
     """
     manager.disable_unit_files([boot.unit])
     try:

@@ -1,6 +1,6 @@
-"""What a dataflow needs: checks before its start, and what people are told about it.
+"""The needs of a dataflow: checks before its start, and notes to the caller.
 
-The units have to exist, and must not wait in a circle.
+The needed units have to exist, and must not wait in a circle.
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ from dora_systemd.names import name_from_unit, unit_name
 from dora_systemd.values import shown
 
 _MOST = 200
-"""Units that are looked at for a circle."""
+"""Maximum units that are checked for a circle."""
 _UNIT_PATHS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
 _GROUPS = ("char-", "block-")
 _HIDDEN = ("/tmp/", "/var/tmp/")
@@ -70,7 +70,7 @@ def _check_unit(manager: Manager, plan: Needy, need: str, unit: str) -> None:
 
 
 def _check_circle(manager: Manager, plan: Needy, need: str, unit: str) -> None:
-    """Follow the dependencies of dataflows; systemd would drop one of a circle's without a word."""
+    """Follow the dependencies of dataflows; systemd would silently drop one of a circle."""
     chain, left = {unit: [unit]}, [unit]
     while left and len(chain) < _MOST:
         one = left.pop()
@@ -98,7 +98,7 @@ def _is_mount(manager: Manager, path: str) -> bool:
 
 
 def _escaped(path: str) -> str:
-    """As systemd-escape(1) --path."""
+    """Escape a path as systemd-escape(1) --path does."""
     text = "".join(map(_escaped_byte, path.strip("/").encode()))
     return f"\\x2e{text[1:]}" if text.startswith(".") else text
 
@@ -126,7 +126,7 @@ def clock_service() -> str:
 def needs_warnings(
     needs: tuple[str, ...], nodes: tuple[NodeNeed, ...], has_mounts: bool, allowed: tuple[str, ...]
 ) -> Iterator[str]:
-    """Warnings about needs that nothing here meets.
+    """Yield warnings about needs that nothing on this machine meets.
 
     has_mounts: the sandbox has a /tmp of its own, and closes devices. allowed: DeviceAllow= of the
     settings.
@@ -142,7 +142,7 @@ def _sandbox_warnings(nodes: tuple[NodeNeed, ...], allowed: tuple[str, ...]) -> 
         if path.startswith(_HIDDEN):
             yield f"node {node} waits for {shown(path)}, but the sandbox has its own /tmp"
     if any(one.startswith(_GROUPS) for one in allowed):
-        return  # probably that of the device: which one it has is only known when it is there
+        return  # probably the group of the device, which is only known when the device exists
     for node, path in lone_devices(nodes):
         reason = "the sandbox opens it only if it is there at the start"
         hint = "name its group of /proc/devices, such as --device char-GROUP"
@@ -150,7 +150,7 @@ def _sandbox_warnings(nodes: tuple[NodeNeed, ...], allowed: tuple[str, ...]) -> 
 
 
 def held_notes(manager: Manager, name: str) -> Iterator[str]:
-    """What a start that nobody has waited for waits for, while systemd holds it."""
+    """Yield what a start without --wait waits for, while systemd holds the start."""
     if needs := format_awaited(manager.awaited(unit_name(name))):
         yield format_wait(START, needs, 0)
 

@@ -49,8 +49,8 @@ class Plan:
     user: pwd.struct_passwd | None  # for User=, None in user scope
     environment: Mapping[str, str]  # all of Environment=
     sandbox: Sandbox = field(default_factory=Sandbox)
-    warnings: tuple[str, ...] = ()  # for people, before it starts
-    notes: tuple[str, ...] = ()  # for people, once it has started
+    warnings: tuple[str, ...] = ()  # printed before the start
+    notes: tuple[str, ...] = ()  # printed after the start
     members: tuple["Member", ...] = ()  # the other machines, if it runs on several
     missing: DoraSystemdError | None = None  # why it cannot start before a build
 
@@ -70,7 +70,7 @@ def make_plan(scope: Scope, request: StartRequest, read: Files | None = None) ->
     directory = working_directory(files, settings)
     user = choose_user(scope, settings[USER], files.place, directory)
     with sight_of(account_of(user)) as sight:
-        dataflow = files.dataflow()  # the process that looks for another user boots meanwhile
+        dataflow = files.dataflow()  # the child that checks paths as another user boots meanwhile
         look = Look(sight, settings, user, directory)
         where = find_where(scope, request, files, dataflow, look)
         check_credentials(scope, credential_files(settings))

@@ -22,7 +22,7 @@ from dora_systemd.trust.sight import Sight
 from dora_systemd.values import shown
 
 _PACKAGE = "/usr/lib/dora-cli/"
-"""Where the package dora-cli has what its wheel says of itself."""
+"""The directory where the package dora-cli has the metadata of its wheel."""
 _BINFMT = Path("/proc/sys/fs/binfmt_misc")
 _OWN_FILES = {"register", "status"}
 
@@ -63,7 +63,7 @@ def _has_emulators() -> bool:
 
 
 def _unusable(path: str, sight: Sight, who: str) -> DoraSystemdError:
-    """Say why a program cannot be executed."""
+    """Return the error with the reason why a program cannot be executed."""
     real = sight.real(path)
     leads = _leads(path, real)
     code = ExitCode.NO_PERMISSION
@@ -85,7 +85,7 @@ def _leads(path: str, real: str) -> str:
 
 
 def _again(path: str) -> str:
-    """Tell how to make a virtual environment again. path: of a program in it."""
+    """Format how to create a virtual environment again. path: of a program in it."""
     place = PurePath(path).parent
     if place.name != "bin":
         return "install it"

@@ -66,7 +66,7 @@ def _read(path: Path) -> Text:
     except DoraSystemdError as error:
         if path.name != DEFAULT_FILE or exists(path):
             raise
-        # Perhaps nobody has named it.
+        # The user may not have named the file.
         hint = "go to the directory of a dataflow, or name its file"
         raise DoraSystemdError(error.message, hint, error.code) from error
 
@@ -74,7 +74,7 @@ def _read(path: Path) -> Text:
 def _refuse_release(path: Path) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a file of a release.
 
-    It is root's, and what it says is not: root must not take settings from it as from its own.
+    Such a file is owned by root, but not written by root, who must not trust its settings.
     """
     if release := release_of(str(path)):
         hint = f"doractl rollback NAME {release} runs that release"
@@ -114,7 +114,7 @@ def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
 
 
 def read_settings_file(path: Path, origin: Place | None = None) -> SettingsFile:
-    """One settings file. origin: of a copy. Raises DoraSystemdError (BAD_INPUT)."""
+    """Read one settings file. origin: of a copy. Raises DoraSystemdError (BAD_INPUT)."""
     text = read_file(path)
     document = parse_yaml(decoded(text.data, path), path, allow_empty=True)
     return SettingsFile(path, origin or text.place, text.data, document)

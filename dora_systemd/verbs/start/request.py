@@ -1,4 +1,4 @@
-"""What is asked for: the first stage of a start."""
+"""The request of a start: its first stage."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -45,7 +45,7 @@ def request_name(request: StartRequest) -> str:
 
 
 def path_of(request: StartRequest) -> Path:
-    """The absolute path that was asked for. Raises DoraSystemdError (BAD_INPUT) if it is empty."""
+    """Return the absolute path of the request. Raises DoraSystemdError (BAD_INPUT) if empty."""
     if not request.dataflow:  # not the working directory: a variable of a script is not set
         raise DoraSystemdError("cannot read '': no path", "name a file", ExitCode.BAD_INPUT)
     try:

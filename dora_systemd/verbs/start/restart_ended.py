@@ -1,7 +1,7 @@
-"""Starts again what has ended, with the settings it had.
+"""Starts an ended dataflow again, with its former settings.
 
-systemd unloads a transient unit at its end. So each start writes what was asked for to the journal,
-in the name of the process that starts; a later start by name makes its plan from that.
+systemd unloads a transient unit at its end. So each start writes its request to the journal, in the
+name of the starting process; a later start by name makes its plan from that record.
 """
 
 import json
@@ -37,7 +37,7 @@ _INIT = "1"
 
 @dataclass(frozen=True)
 class Asked:
-    """A start that was asked for. flags: as in StartRequest, the same in every directory."""
+    """A recorded request of a start. flags: as in StartRequest, with absolute paths."""
 
     name: str
     uuid: str
@@ -50,7 +50,7 @@ class Asked:
         return unit_name(self.name)
 
     def request(self, wanted: "StartRequest") -> "StartRequest":
-        """The same start once more; what `wanted` gives has precedence over the flags it had.
+        """Return the request for the recorded start; flags of `wanted` override recorded ones.
 
         Raises DoraSystemdError (USAGE) for another name.
         """
@@ -72,7 +72,7 @@ def means_name(text: str) -> bool:
 
 
 def note_start(plan: "Plan", request: "StartRequest", command: str) -> None:
-    """Write what was asked for to the journal. command: by which, such as "doractl start"."""
+    """Write the request of a start to the journal. command: such as "doractl start"."""
     options = plan.options
     note_request(
         EVENT,
@@ -135,7 +135,7 @@ def find_start(
 
 
 def _readable(scope: Scope, selector: Selector) -> Asked | None:
-    """As find_asked(), also None for a user who may not read the journal."""
+    """Find the record as find_asked() does; None also if the journal cannot be read."""
     with suppress(DoraSystemdError):
         return find_asked(scope, selector)
     return None

@@ -35,10 +35,10 @@ class LogSource(Protocol):
     """The source of the dataflow's lines."""
 
     def fileno(self) -> int:
-        """For poll(2): readable when there may be lines."""
+        """Return a descriptor for poll(2): readable when there may be lines."""
 
     def print_new(self) -> None:
-        """Print some of the lines that have come since the last look."""
+        """Print some of the lines that were received since the last call."""
 
     def finish(self) -> None:
         """Print the remaining lines of a unit that has ended."""
@@ -110,10 +110,10 @@ def follow_unit(
 
 
 class _Stop:
-    """What signals ask for: to stop the unit, then to kill it.
+    """Handles signals: the first stops the unit, the next kills it.
 
-    due: seconds of the monotonic clock, when it is stopped without a signal. on_stop: called before
-    that.
+    due: seconds of the monotonic clock, when the unit is stopped without a signal. on_stop: called
+    before the stop.
     """
 
     def __init__(
@@ -131,11 +131,11 @@ class _Stop:
 
     @property
     def seconds_left(self) -> float:
-        """Seconds until it is due; infinite once it has been told to stop."""
+        """Seconds until the stop is due; infinite once the stop was requested."""
         return math.inf if self._asked is not None else max(self._due - time.monotonic(), 0)
 
     def ask(self) -> None:
-        """A signal has come, or the time is up."""
+        """Stop the unit after a signal or at `due`; kill it after the next signal."""
         if self._asked is None:
             self._on_stop()
             self._manager.queue_job("StopUnit", self._unit)
@@ -152,7 +152,7 @@ def _exit_status(manager: Manager, unit: str) -> int | None:
         return None
     status: int = state["ExecMainStatus"]
     if status in (RunnerExit.NODES_FAILED, RunnerExit.FAILED_AT_STOP):
-        # Statuses of their own only tell systemd what to do then.
+        # These exit statuses only serve systemd, to decide about a restart.
         return RunnerExit.FAILED
     if state["ExecMainCode"] != _CLD_EXITED and status:
         return 128 + status

@@ -45,7 +45,7 @@ def make_sandbox(
 ) -> Sandbox:
     """The sandbox of the settings. Raises DoraSystemdError for a path that does not exist.
 
-    offers_identity: whether the machine can create a user namespace; None: ask it.
+    offers_identity: whether the machine can create a user namespace; None: find out.
     """
     sight, settings, user, options = look.sight, look.settings, look.user, launch.options
     rights = options.node_rights
@@ -74,7 +74,7 @@ def make_sandbox(
 
 
 def _firm(paths: Sequence[str], user: pwd.struct_passwd | None) -> dict[str, str]:
-    """For each path, the part that systemd may mount for `user`.
+    """Return the part of each path that systemd may mount for `user`.
 
     The user's own view proves nothing: a program of that user can trace the child that checks the
     paths, and forge its answers.
@@ -174,6 +174,6 @@ def _written_by_uv(
 ) -> Iterator[Path]:
     if options.uv and user is not None:
         directory = options.working_directory
-        # `uv run` brings .venv and uv.lock up to date, beside the pyproject.toml.
+        # `uv run` brings .venv and uv.lock up to date, next to the pyproject.toml.
         yield from (Path(one) for one in (directory, uv_project(directory, sight.read)) if one)
         yield from (Path(user.pw_dir, place) for place in _UV_PLACES)

@@ -1,4 +1,4 @@
-"""Resolves the settings of a start, and checks whose files may say what they say."""
+"""Resolves the settings of a start, and checks by owner what a settings file may contain."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -74,7 +74,7 @@ def check_config(scope: Scope, path: Path) -> None:
 
 
 def require_modest(read: SettingsFile) -> None:
-    """Raise DoraSystemdError for what a settings file may not say that is not the caller's."""
+    """Raise DoraSystemdError for settings that a file of another user must not contain."""
     _check_trust(read)
     _check_values(read)
 

@@ -56,9 +56,9 @@ def claim(
     command: str,
     want_boot: bool = False,
 ) -> Claim:
-    """Check the request, prepare its unit and note the request, see restart_ended.py.
+    """Check the request, prepare its unit and record the request, see restart_ended.py.
 
-    command: by which it is asked. want_boot: as a unit file that is started at boot.
+    command: that makes the request. want_boot: as a unit file that is started at boot.
 
     Raises DoraSystemdError; then nothing has changed.
     """
@@ -99,7 +99,7 @@ def restart_asked(
 def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
     """Make sure that `unit` is not running, and change nothing; make_room() comes later.
 
-    Returns the unit file, if there is one. Raises DoraSystemdError (NAME_IN_USE), which says what
+    Returns the unit file, if there is one. Raises DoraSystemdError (NAME_IN_USE), which names what
     is running.
     """
     cell = read_cell(manager, unit)
@@ -139,8 +139,8 @@ def refuse_unit_file(boot: BootUnit) -> None:
 def require_same_user(verb: str, plan: Plan, present: str) -> None:
     """Raise DoraSystemdError (NAME_IN_USE) if a name would go from one user to another.
 
-    A user chooses the name of a directory, and so must not get that of another user's dataflow.
-    present: User= of what has the name now, or "". With --uid somebody has decided it.
+    A user chooses the name of a directory, and so must not get the name of another user's dataflow.
+    present: User= of the unit with the name now, or "". Not checked with --uid, which decides.
     """
     user = "" if plan.user is None else plan.user.pw_name
     if present in ("", user) or plan.settings.is_given(USER):
@@ -155,7 +155,7 @@ def require_same_user(verb: str, plan: Plan, present: str) -> None:
 
 
 def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
-    """The plan, with the UUID of the enabled dataflow if that is from the same file."""
+    """Return the plan with the UUID of the enabled dataflow, if that is of the same file."""
     known = boot.options
     if not boot.is_enabled or known is None or known.dataflow != plan.options.dataflow:
         return plan
@@ -217,7 +217,7 @@ def _link_files(plan: Plan, systemd: int) -> dict[str, str]:
 
 
 def prepared_links(manager: Manager, plan: Plan, systemd: int) -> Beside:
-    """The links to the members of a plan. Those of an ended dataflow of that name are gone then.
+    """Prepare the links to the members of a plan; stop those of an ended dataflow of that name.
 
     Raises DoraSystemdError (NAME_IN_USE).
     """

@@ -54,7 +54,7 @@ def start_unit(
 ) -> Started:
     """Start the unit of a dataflow; if `wait`, wait until its nodes are ready.
 
-    properties: of a transient unit; None for a unit that systemd has loaded. beside: the links of
+    properties: of a transient unit; None for a unit that systemd has loaded. `beside`: the links of
     a dataflow on several machines. Raises DoraSystemdError with the reason when the start fails;
     the unit stays as failed. If the runner refuses the dataflow, no unit is left.
     """
@@ -96,7 +96,7 @@ def _needed(manager: Manager, unit: str, properties: Sequence[Property] | None) 
 def _tell(
     manager: Manager, unit: str, on_stage: StageObserver | None, changes: Mapping[str, Any]
 ) -> None:
-    """Tell the stage of a start; while systemd holds it, what it waits for."""
+    """Report the stage of a start; while systemd holds the start, report what it waits for."""
     tell_stage(on_stage, changes)
     if on_stage and not changes and (needs := format_awaited(manager.awaited(unit))):
         on_stage(format_wait(START, needs, 0))

@@ -1,4 +1,4 @@
-"""The unit of a plan: its properties for systemd, and its text for people."""
+"""The unit of a plan: its properties for systemd, and its text."""
 
 import os
 import sys
@@ -61,7 +61,7 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
 
 
 def passed_on(plan: Plan, systemd_version: int) -> Iterator[str]:
-    """A note for each property that only systemd can judge."""
+    """Yield a note for each property that only systemd can judge."""
     assignments = plan.settings[PROPERTY]
     for key in unknown_keys(assignments):
         yield f"{key}= is passed on as it is: only systemd {systemd_version} can judge it"
@@ -101,8 +101,8 @@ def plan_links(plan: Plan) -> "list[LinkUnit]":
 def format_plan(plan: Plan, manager: Callable[[], Manager], target: str | None = None) -> str:
     """The unit as the text of a unit file, below comments with its name and sources.
 
-    The units of links follow. Their ExecStart= has what the member is told. target: the one that
-    would start it at boot.
+    The units of links follow, whose ExecStart= contains the settings of members. target: would
+    start the unit at boot.
     """
     head = f"# {plan.unit}\n# source: {plan.options.dataflow}\n"
     text = format_unit(_supported(_properties(plan, manager), manager))
@@ -112,7 +112,7 @@ def format_plan(plan: Plan, manager: Callable[[], Manager], target: str | None =
 
 
 def _supported(properties: Properties, manager: Callable[[], Manager]) -> Properties:
-    """Those that this systemd has; all of them where there is none."""
+    """Return the properties that this systemd supports; all of them without systemd."""
     try:
         number = systemd_number(manager())
     except DoraSystemdError:

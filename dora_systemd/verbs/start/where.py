@@ -58,10 +58,10 @@ class Look:
     def find_venv(
         self, dataflow: str, environment: Mapping[str, str], is_unbuilt: bool = False
     ) -> str | None:
-        """--venv, else the caller's VIRTUAL_ENV, else .venv beside the dataflow, else None.
+        """--venv, else the caller's VIRTUAL_ENV, else .venv next to the dataflow, else None.
 
-        is_unbuilt: a build replaces one whose Python cannot be executed. Raises DoraSystemdError
-        for that otherwise.
+        is_unbuilt: whether a build replaces an environment whose Python cannot be executed. Raises
+        DoraSystemdError for such an environment otherwise.
         """
         given = self.settings[VENV]
         if given is not None:
@@ -176,7 +176,7 @@ def find_where(
 def _spread(
     dataflow: Dataflow, options: RunnerOptions, settings: Settings, variables: Mapping[str, str]
 ) -> "tuple[RunnerOptions, tuple[Member, ...]]":
-    """The options of the runner here, and what other machines are told."""
+    """Return the options of this machine's runner, and the members with theirs."""
     is_spread = settings[MACHINES] or any("deploy" in node.raw for node in dataflow.nodes)
     if not (options.machine or is_spread):
         return options, ()
@@ -256,14 +256,14 @@ def choose_user(
         with reached(directory) as (_, place):
             check_identity(dataflow, place)
     except OSError as error:
-        # Its owner could put it back after this, so what cannot be checked is refused. The words
-        # are those of Look.check_reach(): they do not tell what root can see.
+        # The owner could restore the directory after this, so a path that cannot be checked is
+        # refused. The text is that of Look.check_reach(), which does not reveal what root can see.
         raise no_directory(directory) from error
     return _default_entry() if dataflow.uid == 0 else _owner_entry(dataflow.uid, dataflow.path)
 
 
 def no_directory(directory: str) -> DoraSystemdError:
-    """The error for a working directory that is none."""
+    """Return the error for a working directory that is no directory."""
     message = f"cannot use {shown(directory)} as working directory: it is not a directory"
     return DoraSystemdError(message, "correct --working-directory", ExitCode.BAD_INPUT)
 
@@ -276,10 +276,10 @@ def account_of(user: pwd.struct_passwd | None) -> Account | None:
 
 
 def check_identity(dataflow: Place, directory: Place) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) if the owner of `dataflow` may not want this.
+    """Raise DoraSystemdError (BAD_INPUT) if another user may have arranged `directory`.
 
-    The programs come from `directory`. Nobody must get own programs run as another user by placing
-    that user's dataflow file beside them.
+    The programs come from `directory`. No user may get programs executed as another user by placing
+    that user's dataflow file next to the programs.
     """
     reason = dataflow.borrowed or directory.borrowed
     if directory.uid not in (0, dataflow.uid):
