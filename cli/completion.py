@@ -85,7 +85,7 @@ def user_names(_ctx: click.Context, _incomplete: str) -> list[str]:
 
 
 def host_names(_ctx: click.Context, incomplete: str) -> list[str]:
-    """All hosts of the hosts file, each behind what stands before the last comma."""
+    """Complete a list of hosts: every host of the hosts file, after the text before it."""
     from dora_systemd.verbs.remote.hosts import listed_hosts
 
     before, comma, _ = incomplete.rpartition(",")

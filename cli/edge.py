@@ -23,7 +23,7 @@ VERBS = (
     *("reset", "restart", "rollback", "run", "set", "setup", "show", "start", "stop", "top"),
     *("up", "version", "why"),
 )
-"""As in group.py, which takes longer to import than most commands."""
+"""The verbs of group.py, whose import takes longer than most commands."""
 
 
 class Edge(io.TextIOWrapper):
@@ -134,7 +134,7 @@ def asks_for_json(arguments: Sequence[str]) -> bool:
 
 
 def print_error(error: DoraSystemdError, is_json: bool) -> None:
-    """An error on standard error: a line and a hint for people, or an object for programs."""
+    """Print an error on standard error: a line and a hint, or a JSON object."""
     if is_json:
         # Imported late: a command that works does without it.
         from dora_systemd.decisions.views.objects import error_object
@@ -149,7 +149,7 @@ def print_error(error: DoraSystemdError, is_json: bool) -> None:
 
 
 def print_warning(text: str, is_json: bool) -> None:
-    """The same for a warning."""
+    """Print a warning on standard error: a line, or a JSON object."""
     if is_json:
         print_object("warning", {"message": text})
     else:

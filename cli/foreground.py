@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dora_systemd.verbs.remote.attached import MemberLines, SharedLog
 
 FORMATS = ("pretty", "json", "compact")
-"""Those of `dora run --log-format`."""
+"""The formats of `dora run --log-format`."""
 
 _MICROSECOND_NS = 1000
 

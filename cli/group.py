@@ -88,7 +88,7 @@ WORDS_OF_OTHERS = {
     "check": "start --dry-run",
     "validate": "start --dry-run",
 }
-"""Commands of docker, pm2, systemctl and dora, and the command of doractl that does the same."""
+"""Commands of docker, pm2, systemctl and dora, with the equivalent command of doractl."""
 
 _EPILOG = """\b
 Examples:

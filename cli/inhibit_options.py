@@ -24,7 +24,7 @@ def inhibit_options(command: C, or_else: str = "") -> C:
 
 
 def if_inhibited(force: bool, wait: bool) -> IfInhibited:
-    """What the two options ask for. Raises DoraSystemdError (USAGE) for both."""
+    """Return the choice of the two options. Raises DoraSystemdError (USAGE) for both."""
     if force and wait:
         message = "cannot use --force with --wait"
         raise DoraSystemdError(message, "give one of them", ExitCode.USAGE)
@@ -34,7 +34,7 @@ def if_inhibited(force: bool, wait: bool) -> IfInhibited:
 
 
 class TellWaiting:
-    """Tells a person what is waited for, each thing once."""
+    """Prints what a command waits for, each text once."""
 
     def __init__(self) -> None:
         self._told = ""

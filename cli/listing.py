@@ -51,12 +51,12 @@ class ListRequest(NamedTuple):
 
     @property
     def is_filtered(self) -> bool:
-        """Whether it has options that only the list of all dataflows has, and that are rare."""
+        """Whether the request has one of the rare options of the list of all dataflows."""
         return any(one is not None for one in (self.last, self.status, self.pattern, self.sort_by))
 
     @property
     def is_pattern(self) -> bool:
-        """Whether the selector stands for all that match it."""
+        """Whether the selector is a pattern for several dataflows."""
         if self.selector is None:
             return False
         # Imported late: the usual list has no selector.
@@ -94,7 +94,7 @@ def print_dataflows(request: ListRequest) -> int:
     if request.selector is None or request.is_pattern:
         _print_all(_fitting(_rows(bus, scope, request), request), request)
         return ExitCode.OK
-    # Imported late: the table of all dataflows does without it, and is asked for most often.
+    # Imported late: the table of all dataflows, the most frequent output, does not need it.
     from dora_systemd.decisions.views.details import format_dataflow
     from dora_systemd.verbs.list import find_row
 
@@ -121,7 +121,7 @@ def _rows(bus: Manager, scope: Scope, request: ListRequest) -> list[DataflowRow]
     cells = [cell for cell in read_cells(bus) if cell.is_up or cell.has_failed or not is_plain]
     if is_plain and not cells:
         return []
-    # Where nothing runs, a script that asks each second waits for none of these.
+    # Imported late: where nothing runs, a script that calls `list` each second needs none of these.
     from dora_systemd.verbs.facts.list import mark_enabled, table_rows
 
     if request.output == "json":
@@ -182,7 +182,7 @@ def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
 
 
 def _print_nothing(request: ListRequest) -> None:
-    """Say that there is no row, and to an ordinary user where dataflows of the system are."""
+    """Print that there is no row, and for an ordinary user the count of the system's dataflows."""
     if request.want_all or request.is_filtered:
         print("No dataflow.")
         return

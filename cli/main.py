@@ -41,9 +41,9 @@ def _leave(status: int) -> NoReturn:
 
 
 def run(arguments: list[str], dispatch: Callable[[list[str]], int] | None = None) -> int:
-    """Run doractl; the exit status. Errors have been printed, in two lines or as JSON.
+    """Run doractl, and print its errors in two lines or as JSON; return the exit status.
 
-    dispatch: does what the arguments want.
+    dispatch: carries out the arguments.
     """
     try:
         status = (dispatch or _dispatch)(arguments)

@@ -107,7 +107,7 @@ output_option = _output_option(is_exposed=True)
 
 
 def acting_options(command: C) -> C:
-    """Add scope_options, and `-o` for print_outcomes() and tell(), to a verb that acts."""
+    """Add scope_options, and `-o` for print_outcomes() and `tell()`, to a verb that acts."""
     return _output_option(is_exposed=False)(scope_options(command))
 
 
@@ -174,7 +174,7 @@ def print_json(value: Any) -> None:
 
 
 def tell(text: str, err: bool = False) -> None:
-    """A line for people only."""
+    """Print a line, unless the output is JSON."""
     if not wants_json():
         click.echo(text, err=err)
 
@@ -187,7 +187,7 @@ def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) ->
 
 
 def print_outcomes(outcomes: Iterable[Outcome]) -> ExitCode:
-    """One line or one JSON object for each outcome, at once.
+    """Print one line or one JSON object for each outcome, at once.
 
     Returns the exit status of the problem, FAILURE if there are different ones.
     """
@@ -211,6 +211,6 @@ def _print_outcome(one: Outcome) -> None:
 
 
 def print_warnings(warnings: Iterable[str]) -> None:
-    """One line or one JSON object each, on standard error, without empty ones."""
+    """Print one line or one JSON object for each warning that is not "", on standard error."""
     for warning in filter(None, warnings):
         print_warning(warning, wants_json())

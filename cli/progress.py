@@ -79,5 +79,5 @@ class Progress(AbstractContextManager["Progress"]):
 
 
 def open_progress(is_quiet: bool) -> Progress:
-    """That of this command line."""
+    """Return the Progress of this command line."""
     return Progress(sys.stderr, wants_json(), is_quiet)

@@ -51,7 +51,7 @@ class Screen:
         for number in _SIGNALS:
             signal.signal(number, _ignored)
         signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
-        # curses sees handlers that are in place before it, and then has none of its own.
+        # curses installs no handler of its own for a signal that has one already.
         self._window = curses.initscr()
         self._set_modes()
         self._attributes = _attributes(want_colors)
@@ -75,12 +75,12 @@ class Screen:
         return columns, rows
 
     def show(self, lines: Sequence[Line]) -> None:
-        """Draw these lines and nothing else. They are not longer than size() says."""
+        """Draw these lines and nothing else. The lines must fit into size()."""
         self._window.erase()
         for row, line in enumerate(lines):
             attributes = sum(self._attributes[word] for word in line.style.split())
             with suppress(curses.error):  # the terminal has become smaller
-                # Not addstr(), which would go on in the next row.
+                # Not addstr(), which would continue in the next row.
                 self._window.insstr(row, 0, one_line(line.text), attributes)
         self._window.refresh()
 
@@ -153,7 +153,7 @@ def _ignored(_number: int, _frame: object) -> None:
 
 
 def _attributes(want_colors: bool) -> dict[str, int]:
-    """By word of a style, the attribute."""
+    """Return the attribute for each word of a style."""
     attributes = {"bold": curses.A_BOLD, "reverse": curses.A_REVERSE, **dict.fromkeys(_COLORS, 0)}
     with suppress(curses.error):  # a terminal without colours
         if want_colors:
@@ -170,9 +170,10 @@ FIRST_SECONDS = 0.5
 
 
 class Work(Thread):
-    """One change that is being made; a dataflow takes its grace duration to stop.
+    """A change that is being made in a thread; a stop can take the whole grace duration.
 
-    A daemon, so that Ctrl+C ends doractl; systemd goes on, as after Ctrl+C in `doractl stop`.
+    A daemon thread, so that Ctrl+C ends doractl; systemd continues the change, as after Ctrl+C in
+    `doractl stop`.
     """
 
     def __init__(self, scope: Scope, change: Change, view: TopScreen, screen: Screen) -> None:

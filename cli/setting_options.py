@@ -69,7 +69,7 @@ class SettingsCommand(click.Command):
 
     def _format_usual(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         of = {option.opts[0]: record for option, record in self._records(ctx)}
-        # Of a help text what stands before the first semicolon; --help=all has the rest.
+        # Only the part of a help text before the first semicolon; --help=all has the rest.
         rows = [
             (of[flag][0].split(" / ")[0], f"{of[flag][1].split('; ')[0].rstrip('.')}.")
             for flag in self._usual

@@ -54,7 +54,7 @@ class StageLine(AbstractContextManager["StageLine"]):
             self._shown = shown
 
     def _tell_machine(self, text: str) -> None:
-        """Say which machine a start waits for: that may take a while."""
+        """Print which machine a start waits for, because the wait may be long."""
         if not text.startswith("waiting for machine") or text == self._shown:
             return
         # Imported late: most dataflows run on one machine.

@@ -1,4 +1,4 @@
-"""`doractl logs` of a dataflow on several machines: those of all, merged, as of several hosts."""
+"""`doractl logs` of a dataflow on several machines: merges their logs like those of hosts."""
 
 from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
@@ -34,7 +34,7 @@ def print_machines(scope: Scope, context: click.Context) -> int | None:
     if found is None:
         return None
     hosts, plan = found
-    # Each object of a program says where it is from, also if there is one machine only.
+    # Each JSON object contains its machine, also if there is only one.
     output = context.params["output"]
     if len(hosts) > 1 or output == "json":
         return run_on_all(hosts, plan)
@@ -42,7 +42,7 @@ def print_machines(scope: Scope, context: click.Context) -> int | None:
 
 
 def find_machines(scope: Scope, context: click.Context) -> tuple[list[Host], Plan] | None:
-    """The machines whose logs are meant, and what to ask them; None for this machine alone.
+    """Find the machines whose logs are requested, and the command; None for this machine alone.
 
     Raises DoraSystemdError as print_machines().
     """

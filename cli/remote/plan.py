@@ -22,10 +22,10 @@ _ONE_HOST = {
 ROLLOUTS = ("deploy", "rollback")
 """Verbs that some hosts get after others, and no more once a release has failed its trial."""
 _LONG = ("build", "run", "dora", *ROLLOUTS)
-"""Verbs that must not go on over there when this command has ended."""
+"""Verbs that must end on the hosts when this command ends."""
 _FILES = (".yml", ".yaml", ".json")
 _FOLLOWING = ("is_follow", "until_end", "want_logs")
-"""Options by which a verb goes on until somebody ends it."""
+"""Options with which a verb runs until it is interrupted."""
 
 
 class Plan(NamedTuple):
@@ -37,12 +37,12 @@ class Plan(NamedTuple):
     options: dict[str, Any]  # by name, as click reads them
     acts: bool  # it prints an outcome in each line
     wants_json: bool
-    is_endless: bool  # somebody has to end it
+    is_endless: bool  # the command runs until it is interrupted
     key: str = "host"  # what JSON calls a host
 
     @property
     def way(self) -> Way:
-        """How it runs over there, without a terminal."""
+        """How the command runs on hosts, without a terminal."""
         if self.verb == "dora" and not sys.stdin.isatty():
             return Way.FED
         return Way.FOLLOWING if self.is_endless else Way.ONCE
@@ -72,7 +72,7 @@ class Plan(NamedTuple):
 
     @property
     def follows_again(self) -> bool:
-        """Whether it goes on with a host that was lost, when that is back."""
+        """Whether the command connects again to a host that was lost."""
         return self.verb == "logs" and bool(self.options.get("is_follow"))
 
 
@@ -84,7 +84,7 @@ def plan_of(context: click.Context, words: list[str]) -> Plan:
     endless = any(options.get(name) for name in _FOLLOWING) or verb in _LONG
     endless |= verb == "top" and wants_json and not options.get("is_once")
     holds = verb == "inhibit" and options.get("selector") is not None
-    # What waits or holds a lock over there must not go on when this command has ended.
+    # A command that waits or holds a lock on a host must end when this command ends.
     endless |= holds or (verb in ("restart", "reload") and bool(options.get("wait")))
     acts = _acts(context) and (holds or verb != "inhibit")  # the list of locks is one text
     loud = without_flag(words, "-q", "--quiet", valued_flags(context.command))

@@ -1,4 +1,4 @@
-"""Prints what several hosts say, each line, object, row or record with its host."""
+"""Prints the output of several hosts, each line, object, row or record with its host."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import one_line, shown_log
 
 MOST_BYTES = 64 << 20
-"""Of the answer of one host that is printed as a whole."""
+"""Maximum bytes of the answer of one host that is printed as a whole."""
 
 
 class Printer(Protocol):
@@ -41,7 +41,7 @@ class Printer(Protocol):
 
 
 class LinePrinter:
-    """Each line at once, behind its host; or each object, with it."""
+    """Prints each line at once, after its host; or each object, with its host."""
 
     def __init__(self, wants_json: bool) -> None:
         self._wants_json = wants_json
@@ -83,7 +83,7 @@ class Whole:
         return too_much(host) if len(text) > MOST_BYTES else None
 
     def take(self, host: Host) -> str:
-        """All that this host has said."""
+        """Return the whole output of a host, and discard it."""
         return self.texts.pop(host, bytearray()).decode("utf-8", "replace")
 
 
@@ -114,7 +114,7 @@ class BlockPrinter(Whole):
 
 
 class JsonPrinter(Whole):
-    """One list, with the objects of all hosts in the order of the hosts."""
+    """Prints one list, with the objects of all hosts in the order of the hosts."""
 
     def __init__(self, hosts: Sequence[Host]) -> None:
         super().__init__()
@@ -159,7 +159,7 @@ class Complaints:
         value = read_object(line)
         if self._is_json:
             self._print_object(host, value or {"warning": {"message": line}})
-        elif value is not None:  # asked for JSON, to read the answer
+        elif value is not None:  # JSON was requested only to read the answer
             self._print_words(host, value)
         else:
             rest = line.removeprefix("doractl: ")
@@ -188,9 +188,9 @@ Shown = Callable[[Mapping[str, list[Row] | None], int | None, bool], str]
 
 
 class TablePrinter(Whole, Generic[Row]):
-    """One table with a column HOST. nothing: printed instead of an empty one.
+    """Prints one table with a column HOST. nothing: printed instead of an empty table.
 
-    parse: the row of an object, None for what is none.
+    parse: returns the row of an object, None for an invalid object.
     """
 
     def __init__(
@@ -206,11 +206,11 @@ class TablePrinter(Whole, Generic[Row]):
         self._nothing = nothing
 
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
-        """Read its rows."""
+        """Parse the rows of a host that has ended."""
         text = self.take(host).strip()
         if error:
             return None
-        if not text:  # its doractl has said why on standard error
+        if not text:  # doractl of that host has reported the reason on standard error
             self._found[host.text] = []
             return None
         found = objects_of(text, host.text)
@@ -231,11 +231,11 @@ class TablePrinter(Whole, Generic[Row]):
 
 
 FORMS = {"short": "export", "cat": "export", "json": "json"}
-"""By the output that was asked for, the output that the hosts are asked for."""
+"""The output that is requested from the hosts, by the -o of the caller."""
 
 
 def words_of_logs(plan: Plan) -> list[str]:
-    """What each host is asked for. Raises DoraSystemdError (USAGE)."""
+    """Return the command for each host. Raises DoraSystemdError (USAGE)."""
     form = str(plan.options["output"])
     if form not in FORMS:
         hint = f"-o {' or -o '.join(FORMS)}"
@@ -282,7 +282,7 @@ class LogPrinter:
         self.merge.add(host.text, at_us, line, now)
 
     def again(self, host: Host, words: Sequence[str]) -> list[str]:
-        """What a host is asked for when it is back: the lines after the last one."""
+        """Return the command for a host that is reachable again: for lines after the last one."""
         self._records[host] = Records()
         self.merge.begin(host.text)
         since = self._last[host] + 1
@@ -292,7 +292,7 @@ class LogPrinter:
         )
 
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
-        """No more of this host."""
+        """Expect no more records of this host."""
         del error
         self.merge.end(host.text)
         return None

@@ -35,12 +35,12 @@ from dora_systemd.verbs.remote.talk import Ended, Said, Talks
 from dora_systemd.verbs.start.request import StartRequest
 
 SILENCE_SECONDS = 600.0
-"""After which a host is given up that says nothing and takes nothing: its doractl hangs, or its
-disk. ssh notices by itself when the network or sshd does. Each one tells every 30 s which step it
-is at, but not while it checks what it has, syncs 4 GiB to an SD card, or removes an old release."""
+"""Time after which a host is given up that sends and receives nothing, because its doractl or its
+disk hangs. ssh notices by itself when the network or sshd hangs. doractl reports its step every
+30 s, but not while it checks files, syncs 4 GiB to an SD card, or removes an old release."""
 _RECEIVE = "--from-stdin"
 _MOST = 1 << 20
-"""Bytes of the answers of a host, and of what it complains of before the first."""
+"""Maximum bytes of a host's answers, and of its errors before the first answer."""
 
 
 def roll_out(hosts: Sequence[Host], plan: Plan) -> int:
@@ -54,7 +54,7 @@ def roll_out(hosts: Sequence[Host], plan: Plan) -> int:
 def _talks(
     hosts: Sequence[Host], plan: Plan, way: Way, words: list[str], opening: bytes | None = None
 ) -> Talks:
-    """Talks in which each host tells its steps, also with -q: they are its signs of life."""
+    """Return Talks in which each host reports its steps, also with -q, as signs of life."""
     return Talks(
         hosts,
         way,
@@ -83,7 +83,7 @@ def _deploy(hosts: Sequence[Host], plan: Plan, stage: StageLine) -> int:
 
 
 class _Answer:
-    """What a host says. is_taking: whether it has nothing more to ask for."""
+    """The answer of a host. is_taking: whether the host needs no more files."""
 
     def __init__(self, is_taking: bool) -> None:
         self.is_taking = is_taking
@@ -132,7 +132,7 @@ class Rollout:
         self._statuses: dict[Host, int] = {}
 
     def run(self, hosts: Sequence[Host]) -> int:
-        """Talk with all of them; the exit status."""
+        """Run the rollout on all hosts; return the exit status."""
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
         self._columns = Columns(self._plan.verb, [one.text for one in hosts], width)
         if not (self._plan.wants_json or self._is_quiet):

@@ -1,6 +1,6 @@
-"""Runs a verb on one host, as there, or on several at the same time.
+"""Runs a verb on one host, or on several hosts in parallel.
 
-On one host it has its terminal, its output and its exit status.
+On one host the verb has this terminal, and its own output and exit status.
 """
 
 import signal
@@ -97,7 +97,7 @@ def _pass(said: Said, decoder: IncrementalDecoder) -> None:
 
 
 class Interrupts:
-    """During the block, a first Ctrl+C ends what follows over there, and a second one this."""
+    """In the context, a first Ctrl+C ends following commands on hosts, a second one doractl."""
 
     def __init__(self, talks: Talks, plan: Plan) -> None:
         self._talks = talks
@@ -147,25 +147,25 @@ def run_on_all(hosts: Sequence[Host], plan: Plan, opening: bytes | None = None) 
 
 
 class _Again:
-    """Follows hosts again that are lost after their login: that is said once."""
+    """Follows hosts again that are lost after their login; each loss is reported once."""
 
     def __init__(self, talks: Talks, logs: LogPrinter, words: Sequence[str]) -> None:
         self._talks, self._logs, self._words = talks, logs, words
         self._lost: set[Host] = set()
 
     def is_known(self, ended: Ended) -> bool:
-        """Whether the host is away for longer: then its end is no news."""
+        """Whether the host is still unreachable, and its loss was reported before."""
         return ended.error is not None and ended.host in self._lost and not ended.was_in
 
     def ended(self, ended: Ended) -> None:
-        """Talk with the host again, unless its doractl has ended by itself."""
+        """Connect to the host again, unless its doractl has ended by itself."""
         if ended.error and (ended.was_in or ended.host in self._lost):
             self._lost.add(ended.host)
             self._talks.begin_again(ended.host, self._logs.again(ended.host, self._words))
 
 
 def _printer(hosts: Sequence[Host], plan: Plan) -> tuple[list[str], Printer]:
-    """What the hosts are asked for, and what prints their answers."""
+    """Return the command for the hosts, and the printer of their answers."""
     if plan.verb == "logs":
         return words_of_logs(plan), LogPrinter(hosts, plan.options, plan.key)
     if plan.verb == "list" and not plan.wants_json:
@@ -186,7 +186,7 @@ def _printer(hosts: Sequence[Host], plan: Plan) -> tuple[list[str], Printer]:
 
 
 def _is_wide(plan: Plan) -> bool:
-    """Whether `list` looks for more than what runs."""
+    """Whether `list` shows more than running dataflows."""
     return any(plan.options[name] for name in ("want_all", "last", "status", "pattern", "sort_by"))
 
 

@@ -46,7 +46,7 @@ def _removed(kept: Kept, release: str) -> Outcome:
 
 
 def _agrees(kept: Kept) -> bool:
-    """Ask the person at the terminal. Raises DoraSystemdError (USAGE) if there is none."""
+    """Ask at the terminal for a confirmation. Raises DoraSystemdError (USAGE) without terminal."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         message = f"cannot forget {kept.name}: nobody can be asked"
         raise DoraSystemdError(message, "use --force", ExitCode.USAGE)

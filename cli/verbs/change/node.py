@@ -12,7 +12,7 @@ from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import NodeOrder, order_node
 
 _DOORS = {RESTART: "doractl node restart", STOP: "doractl node stop"}
-"""What the journal has for who asked."""
+"""The command that the journal records as requester."""
 
 
 @click.group("node")

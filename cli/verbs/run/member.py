@@ -35,7 +35,7 @@ _FORCED = "dora_systemd.member.forced"
 
 
 class MemberCommand(SettingsCommand):
-    """A verb that sshd may run in the place of what a key has asked for, see sshd(8)."""
+    """A verb that sshd may run as the forced command of a key, see sshd(8)."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         original = os.environ.get(ORIGINAL, "")
@@ -160,6 +160,6 @@ def command(
 
 
 for _one in command.params:
-    # Those of start; the head passes on what it was told.
+    # The options of start; the head passes on those of its own start.
     if isinstance(_one, click.Option) and _one.name in {one.name for one in SETTINGS}:
         _one.hidden = True

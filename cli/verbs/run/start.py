@@ -144,7 +144,7 @@ def _push(bus: Bus, scope: Scope, request: StartRequest) -> None:
 
 
 def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
-    """Print the logs of the dataflow, which goes on if this process ends."""
+    """Print the logs of the dataflow, which keeps running if this process ends."""
     from dora_systemd.cli.foreground import Foreground, print_until_end
     from dora_systemd.verbs.start.run import HELD
 
@@ -160,7 +160,7 @@ def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
 
 
 def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
-    """As systemctl start: what runs goes on running."""
+    """Start a loaded unit as systemctl start does: a running dataflow keeps running."""
     file = cell.options.dataflow
     if cell.has_begun:
         text = f"Dataflow already running: {cell.uuid} ({cell.name})"
@@ -183,7 +183,7 @@ def _print_started(started: Started, file: str, watched: Sequence[str]) -> ExitC
 
 @contextmanager
 def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
-    """Print what the nodes of a dataflow said last if the block fails to start it."""
+    """Print the last lines of the nodes if the context fails to start the dataflow."""
     try:
         yield
     except DoraSystemdError as error:

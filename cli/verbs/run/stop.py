@@ -108,7 +108,7 @@ def _asked(cells: Sequence[Cell]) -> Cell:
 
 
 def _ask_dependents(cells: Sequence[Cell], dependents: Sequence[Cell]) -> None:
-    """Ask on the terminal before other dataflows stop that need these."""
+    """Ask at the terminal before other dataflows stop that need `cells`."""
     if not dependents:
         return
     click.echo(format_dependents(cells, dependents), err=True)
@@ -118,7 +118,7 @@ def _ask_dependents(cells: Sequence[Cell], dependents: Sequence[Cell]) -> None:
 
 
 def _ask_inhibited(scope: Scope, cells: Sequence[Cell]) -> None:
-    """Ask on the terminal before a dataflow stops whose restart is inhibited."""
+    """Ask at the terminal before a dataflow with inhibited restarts stops."""
     for name, holders in read_holders(scope, [cell.name for cell in cells if cell.is_up]).items():
         click.echo(f"{name} is inhibited by {format_holders(holders)}", err=True)
         if not click.confirm(f"Stop {name} anyway?", err=True):
