@@ -20,7 +20,7 @@ MAX_ENTRY = 128 * 1024 - 1
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 LOCK_VARIABLE = "DORA_INHIBIT_LOCK"
-"""In the environment of the nodes: the path of the file that they lock to inhibit restarts."""
+"""Variable of the nodes with the path of the file that they lock to inhibit restarts."""
 MANAGER_VARIABLES = frozenset(
     {
         *("NOTIFY_SOCKET", "JOURNAL_STREAM", "INVOCATION_ID", "SYSTEMD_EXEC_PID", "MAINPID"),
@@ -72,7 +72,7 @@ def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> Runn
 
 
 def parse_assignment(text: str) -> tuple[str, str]:
-    """Key and value of `KEY=VALUE` as `--env` takes it.
+    """Parse key and value of `KEY=VALUE` as `--env` takes it.
 
     Raises DoraSystemdError (USAGE) without "=", for a key or value that systemd refuses in
     Environment= of systemd.exec(5), for control characters and for keys that are systemd's.

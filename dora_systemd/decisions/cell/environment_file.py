@@ -1,7 +1,7 @@
 """Parses the files of --env-file, in the syntax of EnvironmentFile= in systemd.exec(5).
 
-A value may begin with quoted parts, and go on without quotes up to the end of its line. A quote in
-that rest is an ordinary character, so JSON needs no other quotes around it.
+A value may begin with quoted parts, and continue without quotes up to the end of its line. A quote
+in that rest is an ordinary character, so JSON needs no other quotes around it.
 """
 
 import re

@@ -24,7 +24,7 @@ class Exit(NamedTuple):
 
     kind: ExitKind = ExitKind.OTHER
     number: int = 0  # the exit status or the signal
-    words: str = ""  # what the text says after that
+    words: str = ""  # the rest of the text
     by: str = ""  # the node whose failure was the cause, or ""
 
     @property
@@ -77,8 +77,8 @@ EARLY = Exit(ExitKind.CODE, 0, " before it called dora")
 
 
 def parse_exit(text: str) -> Exit:
-    """The end that `text` describes. A text of another version becomes the `words`."""
-    # The owner of a dataflow can write it: no recursion, and no pattern that tries again.
+    """Parse the end that `text` describes. A text of another version becomes the `words`."""
+    # The owner of a dataflow can write the text: no recursion, no pattern that backtracks.
     how, _, node = text.rpartition(_BECAUSE)
     if how and (by := node.removesuffix(_FAILED)) not in ("", node):
         return _parse_own(how)._replace(by=by)
@@ -89,7 +89,7 @@ def parse_exit(text: str) -> Exit:
 
 
 def _parse_own(text: str) -> Exit:
-    """The same for a text that names no other node."""
+    """Parse a text that names no other node."""
     for kind in (ExitKind.HUNG, ExitKind.SILENT):
         if text.startswith(kind.value):
             return Exit(kind, words=text.removeprefix(kind.value))
@@ -103,6 +103,6 @@ def _parse_own(text: str) -> Exit:
 
 
 def find_exit(text: str) -> Exit:
-    """The first exit status or signal in a text that also says other things; Exit() for none."""
+    """Find the first exit status or signal in a text; Exit() for none."""
     numbered = _NUMBERED.search(text)
     return parse_exit(text[numbered.start() :]) if numbered else Exit()

@@ -312,9 +312,9 @@ def _refusal(source: str, node: Node, reason: str, hint: str) -> DoraSystemdErro
 
 
 def _placed_node(node: str, raw: Mapping[str, Any], machine: str) -> dict[str, Any]:
-    """A node on another machine, for dora; with_works() fills in the directory.
+    """Return the definition of a node on another machine; with_works() fills in the directory.
 
-    How it is started, that machine itself knows: the file launch/NODE in its cell says it.
+    The file launch/NODE in the cell of that machine contains the command line of the node.
     """
     kept = {key: value for key, value in raw.items() if key not in _BUILT}
     deploy = {"machine": machine, "working_dir": None}

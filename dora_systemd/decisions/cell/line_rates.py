@@ -27,7 +27,7 @@ class RateLimit(NamedTuple):
 
 
 RateLimits = Mapping[str, RateLimit | None]
-"""By node, with ALL_NODES for the others; None: no limit."""
+"""Limits by node, with ALL_NODES for the others; None: no limit."""
 
 UNLIMITED: RateLimits = {}
 

@@ -40,7 +40,7 @@ def parse_machine(text: str) -> str:
 
 
 def is_host_name(text: str) -> bool:
-    """Whether it can be that of the head."""
+    """Return whether a text can be the host name of the head."""
     return _HOST_NAME.fullmatch(text) is not None
 
 
@@ -73,9 +73,9 @@ def _refusal(text: str, hint: str) -> DoraSystemdError:
 NOT_CONNECTED = "it is not connected yet"
 NOT_JOINED = "it has not answered yet"
 USUAL = (NOT_CONNECTED, NOT_JOINED)
-"""What each start waits for, for a moment."""
+"""Reasons for which each start waits a moment."""
 ENDED = "the connection has ended"
-"""Of a link before it says more."""
+"""The reason of a lost connection until the link reports a better one."""
 _BEGIN = "waiting for machine"
 
 

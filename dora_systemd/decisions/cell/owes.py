@@ -14,17 +14,17 @@ from dora_systemd.names import check_known, did_you_mean
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 PROBE = "dora-systemd-probe"
-"""The beginning of dora's id of the node that hears the outputs; its cgroup is node-PROBE. See
+"""The beginning of dora's id of the node that receives the outputs; its cgroup is node-PROBE. See
 decisions/owes/probe.py."""
 
 RESTART, WARN, FAIL = "restart", "warn", "fail"
 THEN = (RESTART, WARN, FAIL)
 STARVED = ", starved of "
-"""Before the input, NODE/OUTPUT, that a silent node lacks; `why` reads it."""
+"""The text before the input, NODE/OUTPUT, that a silent node lacks; `why` parses it."""
 KEYS = ("output", "within", "first", "then")
 
 SHORTEST = SECOND // 5
-"""µs. Whoever watches has to look several times within this."""
+"""The shortest `within`, in µs: the runner checks several times within that time."""
 FIRST = 30 * SECOND
 """µs; the default of `first`, unless `within` is longer."""
 
@@ -35,7 +35,7 @@ _HINT = f"write {_FORM}; within is required"
 class Owed(NamedTuple):
     """One output that a node owes. Times in µs."""
 
-    node: str  # "" where the place says which
+    node: str  # "" if the context determines the node
     output: str
     within: int  # between two messages
     first: int = FIRST  # from the start of the node to its first message
@@ -61,7 +61,7 @@ def parse_owed(text: str) -> Owed:
 
 
 def format_owed(owed: Owed) -> str:
-    """As in the runner's command line: `camera/image:within=2s,first=30s,then=restart`."""
+    """Format for the runner's command line: `camera/image:within=2s,first=30s,then=restart`."""
     within, first = format_duration(owed.within), format_duration(owed.first)
     return f"{owed.place}:within={within},first={first},then={owed.then}"
 
@@ -102,7 +102,7 @@ def _wrong(reason: str, hint: str) -> DoraSystemdError:
 
 
 def merge_owed(*given: Iterable[Owed]) -> tuple[Owed, ...]:
-    """All of them; of several for the same output the last one."""
+    """Join owed outputs; of several for the same output the last one counts."""
     return tuple({one.place: one for many in given for one in many}.values())
 
 

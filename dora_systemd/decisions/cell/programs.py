@@ -7,7 +7,7 @@ _ELF = b"\x7fELF"
 _MACHINES = {3: "i686", 21: "ppc64", 40: "arm", 62: "x86_64", 183: "aarch64", 243: "riscv64"}
 """e_machine of elf(5), and the word of uname(1)."""
 _ALSO = {"x86_64": ("i686",), "aarch64": ("arm",)}
-"""What a kernel of a machine may execute besides."""
+"""Other machines whose programs the kernel of a machine may execute, too."""
 _INFO = re.compile(r"(\d{1,9}(?:\.\d{1,9}){1,3}[0-9A-Za-z.+]{0,20})\.dist-info")
 _PYTHON = re.compile(r"python3\.\d{1,3}")
 
@@ -35,7 +35,7 @@ def script_interpreter(head: bytes) -> str:
 
 
 def python_directories(names: Iterable[str]) -> list[str]:
-    """Those that can be the directory of a Python, such as python3.13."""
+    """Return the names that can be the directory of a Python, such as python3.13."""
     return [one for one in names if _PYTHON.fullmatch(one)]
 
 

@@ -1,12 +1,12 @@
-"""What single nodes may do that the others may not, and the programs that set it. Pure.
+"""The rights of single nodes, and the programs that set these rights. Pure.
 
 The runner's command line contains these rights, so this module imports only what loads quickly.
 
 The programs are those of util-linux and coreutils: prlimit(1), chrt(1), nice(1), taskset(1),
-choom(1). Each one sets one thing, and executes the next one. What raises rights is granted by the
-unit to all of its processes, see decisions/unit/properties.py. So the other nodes give it up here.
-They give up hard limits, which no process gets back. An OOM score adjustment can be lowered again,
-to what the unit has: the kernel keeps that value for all children.
+choom(1). Each program sets one right, and executes the next program. The unit grants raised rights
+to all of its processes, see decisions/unit/properties.py. So programs for the other nodes take
+these rights away: hard limits, which no process gets back. An OOM score adjustment can be lowered
+again, to the value of the unit, which the kernel keeps for all children.
 """
 
 import re
@@ -121,7 +121,7 @@ class NodeRights(NamedTuple):
 
     @property
     def priority(self) -> int:
-        """Its realtime priority, 0 without one."""
+        """The realtime priority of the node, 0 without one."""
         policy, _, priority = (self.scheduling or "").partition(":")
         return int(priority) if policy in REALTIME else 0
 
@@ -196,7 +196,7 @@ def check_rights_nodes(
 
 
 OTHERS = "*"
-"""Stands for all nodes without rights of their own; no node has this id."""
+"""The id for all nodes without rights of their own, which no node has."""
 NICE_LIMIT = 20
 """RLIMIT_NICE is this minus the lowest nice value, see getrlimit(2)."""
 BEHIND_ESSENTIAL = 500

@@ -1,7 +1,8 @@
 """The live table of one cell: the runner writes it to status.json, and `list` reads it. Pure.
 
-NodeAsked of life/events.py says that a restart or a stop of a node was requested, before it is
-done. The table keeps that: what counts, shows or judges an end calls was_asked() or is_stopped().
+NodeAsked of life/events.py records a requested restart or stop of a node before dora carries it
+out. The table keeps the request: code that counts, shows or judges an end calls was_asked() or
+is_stopped().
 """
 
 import json
@@ -78,9 +79,9 @@ class NodeStatus(NamedTuple):
     is_ended: bool = False  # the runner ends the node because it is silent
     needs: str = ""  # what it waits for, or ""
     machine: str = ""  # the name of the other machine that it runs on, or ""
-    asked: str = ""  # RESTART or STOP, if somebody has asked for it, or ""
-    asked_by: str = ""  # who asked
-    # whether dora only has a launcher of it, which waits because a stop was asked for
+    asked: str = ""  # RESTART or STOP, if that was requested, or ""
+    asked_by: str = ""  # who requested it
+    # whether dora only has a launcher of the node, which waits because a stop was requested
     is_held: bool = False
 
     @property
@@ -277,25 +278,25 @@ RESTART, STOP = "restart", "stop"
 
 
 def was_asked(node: NodeStatus) -> bool:
-    """Whether an end of the node's process is what somebody has asked for.
+    """Return whether an end of the node's process was requested.
 
-    A restart covers the process that it ends, and not the next one: that can crash.
+    A restart covers the process that it ends, and not the next process, which can crash.
     """
     return is_stopped(node) or (node.asked == RESTART and node.state == "reloading")
 
 
 def is_stopped(node: NodeStatus) -> bool:
-    """Whether somebody has stopped the node, and nobody has started it again."""
+    """Return whether the node was stopped by a request, and not started again."""
     return node.asked == STOP
 
 
 def is_stopping(node: NodeStatus) -> bool:
-    """Whether a node that somebody has stopped has still a process, other than its launcher."""
+    """Return whether a stopped node still has a process, other than its launcher."""
     return is_stopped(node) and bool(node.pid) and not node.is_held
 
 
 def format_stopped(stopped: Mapping[str, str]) -> str:
-    """As "plot, requested by root (doractl node stop)"; "" if nobody has stopped a node.
+    """Format "plot, requested by root (doractl node stop)"; "" if no node was stopped.
 
     stopped: for each node the user and command that requested its stop, or "".
     """

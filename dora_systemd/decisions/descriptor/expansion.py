@@ -90,6 +90,6 @@ def _names(text: str, with_default: bool = True) -> Iterator[str]:
 
 
 def _parts(text: str) -> tuple[str, str]:
-    """The text up to its last "}", and the rest, in which each "${" would look for one in vain."""
+    """Split a text after its last "}": in the rest, "${" has no end."""
     head, brace, rest = text.rpartition("}")
     return head + brace, rest

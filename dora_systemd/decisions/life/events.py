@@ -86,7 +86,7 @@ class NodeExited(Event):
     will_restart: bool  # dora is going to execute it again
     is_stale: bool = False  # a newer process of the node is already running
     oom: Oom | None = None  # the OOM kill, if the kernel killed it because of memory
-    is_essential: bool = False  # the dataflow ends if the node has failed for good
+    is_essential: bool = False  # the dataflow ends if the node fails finally
 
 
 @dataclass(frozen=True)

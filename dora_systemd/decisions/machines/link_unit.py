@@ -24,7 +24,7 @@ from dora_systemd.values import SECOND
 _BETWEEN = ":"
 """The separator occurs in no name of a dataflow or machine, so two links have different units."""
 _WATCHDOG = 25 * SECOND
-"""µs without a word of a link: longer than all that it waits for, on a machine that is busy too."""
+"""µs without a WATCHDOG=1 of a link: longer than all waits of a link, also on a busy machine."""
 _MOST = 255
 """Bytes of a unit's name, see systemd.unit(5)."""
 

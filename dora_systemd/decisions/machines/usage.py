@@ -50,7 +50,7 @@ def told_use(use: Usage, samples: tuple[CpuSample, ...], now: CpuSample, node: s
 
 
 def parse_use(raw: Any) -> NodeUse | None:
-    """The usage in a table that another machine has written; None for what is none."""
+    """Parse the usage in a table that another machine has written; None if it is invalid."""
     match raw:
         case [float() as cpu, float() as throttled, used, periods, late, memory, peak, most, share]:
             are_shares = 0 <= cpu <= _MOST_PERCENT and 0 <= throttled <= 100
@@ -88,7 +88,7 @@ def merged(table: CellStatus, others: Mapping[str, CellStatus]) -> CellStatus:
     nodes = {ident: _told(ident, node, others) for ident, node in table.nodes.items()}
     away = {ident: others[n.machine] for ident, n in table.nodes.items() if n.machine in others}
     lines = {ident: one.lines[ident] for ident, one in away.items() if ident in one.lines}
-    # Not what is none: a member must not fill the table of the head. Its clock has another zero.
+    # Only valid ones: a member must not fill the table of the head. Its clock has another zero.
     said = {node: parse_sign(one.signs[node]) for node, one in away.items() if node in one.signs}
     signs = {**table.signs, **{node: (one.status, 0, 0) for node, one in said.items()}}
     usage = {node: one.usage[node] for node, one in away.items() if parse_use(one.usage.get(node))}

@@ -45,7 +45,7 @@ def need_steps(
         for node in missing.keys() & nodes.keys():
             yield from _step(node, nodes[node], missing[node], node in passed)
         return
-    # Dora starts all nodes together, so one that went on early would only wait elsewhere, and could
+    # dora starts all nodes together: a node that starts early would only wait elsewhere, and could
     # lose its device meanwhile, which dora counts as a failed start.
     lacking = [
         node

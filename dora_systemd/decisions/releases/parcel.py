@@ -57,7 +57,7 @@ def format_parcel(one: Parcel) -> bytes:
 
 
 def parse_parcel(line: bytes) -> Parcel:
-    """The parcel of a first line. Raises DoraSystemdError (BAD_INPUT) for what is none."""
+    """Parse the parcel of a first line. Raises DoraSystemdError (BAD_INPUT) for another line."""
     try:
         value = json.loads(line)
         if value.pop("schema") != SCHEMA:

@@ -126,7 +126,7 @@ class Records:
 
 
 def time_of(value: object) -> int:
-    """A time of the journal as µs; 0 for what is none."""
+    """Parse a time of the journal in µs; 0 for an invalid one."""
     try:
         number = int(value) if isinstance(value, str | bytes) else 0
     except ValueError:

@@ -55,7 +55,7 @@ def read_json(text: str) -> Any:
 
 
 def read_object(text: str) -> dict[str, Any] | None:
-    """The object in a text; None for what is none, and for one that json could not write again."""
+    """Parse the object in a text; None for other text, and for one that json cannot write."""
     value = read_json(text)
     return value if isinstance(value, dict) and _is_printable(value) else None
 

@@ -46,7 +46,7 @@ def _items(settings: Settings, node: str) -> set[tuple[str, str]]:
 Texts = Mapping[str, str | Sequence[str]]
 """Options by name of the setting, as of given_texts()."""
 _WITHOUT_VALUES = (ENV, PROPERTY, WORKING_DIRECTORY)
-"""Their values may be secrets, or a directory that is gone."""
+"""Settings that are shown without values: secrets, or a directory that is gone."""
 
 
 def lost_options(former: Texts, now: Texts, settings: Settings) -> list[str]:

@@ -33,7 +33,7 @@ class Kind(Generic[T]):
     """One kind of value."""
 
     schema: Any  # what a settings file may contain, as a type for pydantic
-    expected: str  # the same in words, for messages
+    expected: str  # the accepted texts, for messages
     # from the text of a flag or variable, a sequence of texts, or a settings file's value
     parse: Callable[[Any, Base], T]
     # the text from which parse makes the same value; several texts for repeatable kinds
@@ -87,7 +87,7 @@ def listed(value: Any) -> Sequence[Any]:
 
 
 def texts_of(value: Any) -> list[str]:
-    """The same as texts."""
+    """Return a value as texts."""
     return list(map(scalar_text, listed(value)))
 
 
@@ -134,7 +134,7 @@ def texts_of_nodes(
     to_text: Callable[[T], str],
     merge: Callable[[Iterable[T], Iterable[T]], tuple[T, ...]],
 ) -> Kind[tuple[T, ...]]:
-    """A repeatable kind of texts about one node each. merge: joins what is about the same node."""
+    """A repeatable kind of texts about one node each. merge: joins values for the same node."""
     return Kind(
         str | list[str],
         f"{example} or a list of such texts",

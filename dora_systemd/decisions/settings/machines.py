@@ -23,7 +23,7 @@ class Declared(NamedTuple):
 
 
 Machines = Mapping[str, Declared]
-"""By name."""
+"""Declared machines by name."""
 
 
 def _parse(value: Any, base: Base) -> Machines:
@@ -43,7 +43,7 @@ def _split(text: str) -> tuple[str, Mapping[str, str]]:
 
 
 def _merge(lower: Machines, higher: Machines) -> Machines:
-    """Machines with the same name are joined key by key."""
+    """Join machines; those with the same name are joined key by key."""
     joined = {name: _joined(lower[name], higher[name]) for name in lower.keys() & higher.keys()}
     return {**lower, **higher, **joined}
 

@@ -89,7 +89,7 @@ def resolve_settings(
 
     flags: raw values by name of the setting: a text, a sequence of texts, a boolean, or None and ()
     for a flag that was not given. environment: the caller's variables. files: pairs of the file's
-    absolute path and its document, None if empty; relative paths in it start beside the file.
+    absolute path and its document, None if empty; relative paths in a file start at its directory.
     Variables of `env` merge key by key; lists of files and of properties are joined, highest
     precedence last. Raises DoraSystemdError: USAGE for flags and variables, BAD_INPUT for files.
     """
@@ -109,7 +109,7 @@ def resolve_settings(
 def given_texts(
     flags: Mapping[str, object], environment: Mapping[str, str], directory: PurePath
 ) -> dict[str, str | list[str]]:
-    """What flags and variables give, as flags that mean the same in every directory.
+    """Return what flags and variables set, as flags that are valid in every directory.
 
     directory: where relative paths start. Raises DoraSystemdError (USAGE) as resolve_settings().
     """

@@ -207,7 +207,7 @@ _TOLD = [(one.field or one.key, one.told) for one in NODE_FACTS if one.told]
 
 
 def node_row(node: str, status: "NodeStatus | None", known: Mapping[str, Any]) -> NodeRow:
-    """The row of a node. status: in the runner's table, if it is there. known: other fields."""
+    """Return the row of a node. status: from the runner's table, or None. known: other fields."""
     told = {name: read(status) for name, read in _TOLD} if status else {"state": UNKNOWN_STATE}
     return NodeRow(node, **told, **known)
 

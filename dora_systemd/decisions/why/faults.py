@@ -14,7 +14,7 @@ FAULTS = (
 )
 ENDS = ("dataflow-finished", "dataflow-stopped")
 FAULT_IDS = tuple(EVENTS[name].message_id for name in (*FAULTS, *ENDS))
-"""The MESSAGE_IDs that a trial looks for."""
+"""The MESSAGE_IDs that a trial searches."""
 _HOW = {"node-watchdog": "hung, ", WAITING: "waits for "}
 """The text that `why` and `list` show before the reason, instead of the name of the event."""
 
