@@ -14,7 +14,7 @@ from dora_systemd.values import quoted
 UNIT_PREFIX = "dora-"
 UNIT_SUFFIX = ".service"
 LINK_PREFIX = "doralink-"
-"""Of the units of links to other machines."""
+"""Prefix of the units of links to other machines."""
 SLICE = "dora.slice"
 RESERVED_NAMES = frozenset({"gateway"})
 """dora-gateway.service is the gateway."""

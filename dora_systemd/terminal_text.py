@@ -38,7 +38,7 @@ def one_line(text: str) -> str:
 
 
 def short_line(text: str, most: int) -> str:
-    """Words of somebody else within a message: one line without needless blanks, `most` bytes."""
+    """Shorten a foreign text for a message: one line without needless blanks, `most` bytes."""
     line = " ".join(one_line(text).split())
     if len(line.encode()) <= most:
         return line

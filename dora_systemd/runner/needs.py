@@ -82,7 +82,7 @@ Definition = Callable[[str], Mapping[str, Any]]
 
 
 def wait_for_needs(run: Run, options: RunnerOptions, definition: Definition, spawn: Spawn) -> None:
-    """Begin to look for what nodes need, whose gates are closed.
+    """Begin to check for what nodes need, whose gates are closed.
 
     definition: a node as dora gets it. spawn: begins a task of the run.
     """

@@ -202,7 +202,7 @@ class Project:
 
 
 def _libraries() -> str:
-    """The directory that has pathspec, which the interpreter of the child does not look for."""
+    """Return the directory with pathspec, which the child's interpreter does not search."""
     found = find_spec("pathspec")
     assert found and found.origin
     return str(Path(found.origin).parents[1])

@@ -88,7 +88,7 @@ class Manager(Protocol):
         """Send `signal` to the processes of a unit: main, control or all. Thaws the unit first."""
 
     def thaw(self, unit: str) -> bool:
-        """Thaw a unit that somebody has frozen, see `systemctl freeze`; whether it was frozen.
+        """Thaw a frozen unit, see `systemctl freeze`; return whether the unit was frozen.
 
         systemd refuses to stop a frozen unit. If its main process is killed, systemd 257 starts
         ExecStopPost= in a frozen cgroup and waits for it forever: PID 1 hangs.

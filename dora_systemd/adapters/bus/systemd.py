@@ -1,4 +1,4 @@
-"""Talks to systemd over D-Bus; the methods of Bus are the only calls to it.
+"""Calls systemd over D-Bus; no other code than the methods of Bus does.
 
 The interfaces are those of org.freedesktop.systemd1(5). Bus uses the low level of pystemd and
 passes the signature of every argument itself, so it needs no introspection; `property_types` is for

@@ -87,7 +87,7 @@ def spooled() -> Iterator[Spool]:
 class Stream:
     """The bytes of a file descriptor. All methods raise DoraSystemdError at an early end.
 
-    seconds: timeout for more bytes: the sender may be stopped, or gone without a word.
+    seconds: timeout for more bytes: the sender may be stopped, or gone without a notice.
     """
 
     def __init__(self, fd: int, seconds: float = 90.0) -> None:
@@ -152,7 +152,7 @@ def incoming(root: Path) -> Iterator[Draft]:
 def _begun(store: Store) -> Draft:
     """A draft in the directory that all senders share. Raises OSError."""
     for _ in range(_RACES):
-        # The last one removes it, perhaps between the moment that it was there and this draft.
+        # Another process may remove the directory just before this draft is created in it.
         with contextlib.suppress(FileNotFoundError):
             return _begin(store)
     return _begin(store)

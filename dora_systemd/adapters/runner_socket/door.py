@@ -61,7 +61,7 @@ class Door:
         self._work.start()
 
     def hand_over(self) -> tuple[socket.socket, list[Kept]]:
-        """Stop; the listener, and the connections that have come. Call it once."""
+        """Stop, and return the listener and the accepted connections. Call hand_over() once."""
         os.close(self._end)
         self._work.join()
         os.close(self._over)

@@ -18,7 +18,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 
 Answer = Callable[[Request], Awaitable[dict[str, Any]]]
 Session = Callable[[Request, Ends], Coroutine[Any, Any, None]]
-"""Talks with the caller until one of both ends it, after the request that has begun it."""
+"""Serves one connection after the request that has begun the session, until either side ends."""
 Reach = Callable[[], Coordinator]
 """The address of the coordinator. Raises DoraSystemdError (NOT_RUNNING) if it does not listen yet.
 """

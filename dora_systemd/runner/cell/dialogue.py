@@ -1,4 +1,4 @@
-"""Talks to dora for the runner: carries out the actions of decisions/life/table.py.
+"""Sends requests to dora for the runner: carries out the actions of decisions/life/table.py.
 
 Each action is a request to the coordinator, or a signal to one of dora's processes. Its answer
 becomes an event of the pump, and so does every exception.

@@ -1,4 +1,4 @@
-"""What the head knows of its members, and its talks with them.
+"""What the head knows of its members, and its connections to them.
 
 Each member is a session at the head's socket, which the link to that machine begins.
 """
@@ -61,7 +61,7 @@ class Member:
         self.has_left = False  # the member has reported a clean end
         self.is_over = False  # it has reported an end, and is not ready again in this connection
         self.failed = 0  # attempts to connect in a row that have failed
-        self.checked: wire.Checked | None = None  # the answer to the last Check, if it has come
+        self.checked: wire.Checked | None = None  # the answer to the last Check, if received
 
     @property
     def is_heard(self) -> bool:
@@ -113,7 +113,7 @@ class Roster:
         self._is_closed = True
 
     def begin_again(self, ports: wire.Forwards, lost: frozenset[str]) -> None:
-        """Another run begins in this process: end the talks of the last one."""
+        """End the connections of the last run, because another run begins in this process."""
         self._ports, self._token, self._is_closed, self.lost = ports, "", False, lost
         for member in self._members.values():
             lines, member.lines = member.lines, None

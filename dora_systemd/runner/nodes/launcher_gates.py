@@ -120,7 +120,7 @@ class Gates:
                 pass
 
     def refill(self, node: str) -> None:
-        """Dora has started the node once more: it has taken a word, if it went on."""
+        """Refill an open gate after dora has started the node, whose launcher has read a word."""
         if node in self._passing:
             self.open(node)
 

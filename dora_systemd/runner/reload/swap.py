@@ -7,7 +7,7 @@ busy machine dora may then deliver no message to the new one. RemoveNode closes 
 other nodes have from the node, and AddNode does not open them again. So the Swapper sends
 
     RemoveNode, then AddNode         if nobody reads the node
-    RestartNode, then ReplaceNode    if somebody does: ReplaceNode starts the new process at once
+    RestartNode, then ReplaceNode    if other nodes do: ReplaceNode starts the new process at once
     ReplaceNode                      if dora would not restart it, or it has no process, or by the
                                      setting the new process starts first
 
