@@ -59,7 +59,7 @@ class Gone(Exception):
 
 
 class Sink(Protocol):
-    """Where the lines of a build go."""
+    """The receiver of the lines of a build."""
 
     def write(self, line: bytes, words: str) -> None:
         """Write a line. words: the line as it is shown. Raises Gone if nobody reads the output."""
@@ -123,7 +123,7 @@ class ToReader:
 
 
 class Output:
-    """What the build prints."""
+    """The output of a build."""
 
     def __init__(self, sink: Sink) -> None:
         self._sink = sink
@@ -212,7 +212,7 @@ def _read(pipe: int, output: Output) -> bool:
 
 
 def failure(task: BuildTask, command: Sequence[str], status: int, output: Output) -> str:
-    """Why the build failed, in one line."""
+    """Return why the build failed, in one line."""
     said = parse_uv_error(output.tail) if _is_uv(command) else _dora_error(output.tail)
     reason = said or f"{quoted(' '.join(command))} failed: {exit_of(status)}"
     # uv's error has its last lines.

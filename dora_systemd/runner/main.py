@@ -152,7 +152,7 @@ class Runs:
 
 
 def role_of(options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> Alone:
-    """What this machine is in the dataflow of `options`. boot: of the first run."""
+    """Return the role of this machine in the dataflow of `options`. boot: of the first run."""
     if not options.placed:
         return Alone(options, this_life)
     if options.machine:
@@ -220,7 +220,7 @@ def goes_on(runs: Runs, last: Cell) -> bool:
 
 
 async def run_once(runs: Runs, is_again: bool) -> Cell:
-    """One run of the dataflow with its own dora; the cell at the end. Raises DoraSystemdError."""
+    """Run the dataflow once with its own dora; return the last cell. Raises DoraSystemdError."""
     started_us, options, reloader = now_us(), runs.reloader.options, runs.reloader
     boot = None if is_again else runs.boot
     role, own = runs.role, runs.role.own(options)

@@ -67,7 +67,7 @@ def was_stopped_early(environ: Mapping[str, str]) -> bool:
 
 
 def killed_by(environ: Mapping[str, str]) -> tuple[Cause, str]:
-    """How the runner was killed, see EXIT_CODE in systemd.exec(5); "" if it exited by itself."""
+    """Return how the runner was killed, see EXIT_CODE in systemd.exec(5); "" for an exit."""
     result = environ.get("SERVICE_RESULT", "")
     if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
         return Cause.RUNNER_KILLED, ""

@@ -245,7 +245,7 @@ class Pump:
 
 
 def _name(action: Action) -> str:
-    """What the action does, as in "could not ..."."""
+    """Return the name of an action, as in "could not ..."."""
     match action:
         case Do():
             return action.value

@@ -152,7 +152,7 @@ class Member(Shared):
     def dialogue(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> Dialogue:
-        """What finds the run of the head, and judges its own nodes only."""
+        """Return the Dialogue that finds the run of the head, and handles this machine's nodes."""
         assert isinstance(dora, MemberEngine)
         pipes.left_out = NOISE
         self._pump, pump.amend = pump, partial(self._note_table, Uses(nodes))
@@ -214,7 +214,7 @@ class Member(Shared):
         self._end_by_head(why)
 
     def _other_version(self, part: wire.Part) -> str:
-        """Why two versions of dora do not work together, or ""."""
+        """Return why two versions of dora do not work together, or ""."""
         own, other = version_numbers(self._version)[:2], version_numbers(part.dora)[:2]
         there = short_line(part.dora, _LONGEST)
         return "" if own == other else f"it has dora {self._version}, the head has {there}"

@@ -114,7 +114,7 @@ class MemberDialogue(Dialogue):
         return not node or is_here(self._options, node)
 
     def _tell_result(self) -> None:
-        """How the own nodes have ended, from the own table: the head may be gone already."""
+        """Push the ends of this machine's nodes, from its table: the head may be gone already."""
         cell = self._pump.cell
         if cell.state is State.CLOSING:
             results = {ident: node.exit for ident, node in cell.nodes.items()}

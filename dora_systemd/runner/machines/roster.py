@@ -51,7 +51,7 @@ Endpoints = Mapping[str, tuple[str, int]]
 
 
 class Member:
-    """What the head knows of one member."""
+    """The state of one member, as the head knows it."""
 
     def __init__(self) -> None:
         self.lines: Lines | None = None  # the connection, if there is one
@@ -132,7 +132,7 @@ class Roster:
         return {name: one.work for name, one in self._members.items()}
 
     def endpoints(self) -> Endpoints:
-        """Where zenoh of each machine listens, if ssh is not on the way."""
+        """Return where zenoh of each machine listens, with `link: direct`."""
         addresses = dict(zip(self._members, self._options.addresses[1:], strict=False))
         return {name: (one, self._ports.zenoh[name]) for name, one in addresses.items()}
 

@@ -30,7 +30,7 @@ class Resources:
         self._alarms: Alarms = {}
 
     def explain(self, group: Path) -> Oom | None:
-        """Why a process in a group has just ended, if memory was the reason."""
+        """Find whether a process in a group has just been killed because of memory, and how."""
         node = self._seen.get(group, OomCounts()), read_oom(group)
         if node[1] == node[0]:
             return None

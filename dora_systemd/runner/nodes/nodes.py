@@ -228,7 +228,7 @@ class Nodes:
             self.notify_sockets.forget(node)
 
     def signs(self) -> dict[str, "Sign"]:
-        """What nodes have sent to their notify sockets."""
+        """Return the last messages of nodes to their notify sockets."""
         return self.notify_sockets.table() if self.notify_sockets else {}
 
     def is_blocked(self, node: str) -> bool:
@@ -251,11 +251,11 @@ class Nodes:
             await asyncio.sleep(_GONE_SECONDS)
 
     def find_oom(self, node: str) -> Oom | None:
-        """How the kernel has just killed a process of `node` because of memory, or None."""
+        """Find how the kernel has just killed a process of `node` because of memory, or None."""
         return self.resources.explain(self._group(node))
 
     def find_oom_of_dora(self) -> Oom | None:
-        """How the kernel has just killed dora's own processes because of memory, or None."""
+        """Find how the kernel has just killed dora's own processes because of memory, or None."""
         return self.resources.explain(self._unit / cgroup.SUPERVISOR)
 
     def kill(self) -> None:

@@ -89,7 +89,7 @@ class Watch:
             self._act(one)
 
     def _lives(self, now: int) -> dict[str, int]:
-        """When the process of each node that runs became ready, CLOCK_MONOTONIC."""
+        """Return when the process of each running node became ready, CLOCK_MONOTONIC."""
         cell = self._run.pump.cell
         if cell.state is not State.RUNNING:
             return {}
@@ -163,7 +163,7 @@ class SharedTimes:
             os.close(descriptor)
 
     def read(self) -> bytes:
-        """What is in the file now."""
+        """Read the content of the file."""
         return self._map[:]
 
     def close(self) -> None:

@@ -67,7 +67,7 @@ class Applier:
         self.done: list[str] = []
 
     def obstacle(self) -> str:
-        """Why dora cannot change single nodes now, or ""."""
+        """The reason why dora cannot change single nodes now, or ""."""
         if self.run.pump.cell.state is not State.RUNNING:
             return "not all nodes were ready"
         for step in self._change.steps:

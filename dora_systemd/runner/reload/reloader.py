@@ -102,7 +102,7 @@ class Reloader:
         self._begun.clear()
 
     def has_started(self) -> None:
-        """All nodes of the run are ready: the version before is not needed any more."""
+        """Forget the former version, because all nodes of the run are ready."""
         self.before = None
         self._settle("")
         if not self.options.placed:

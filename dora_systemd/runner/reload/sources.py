@@ -85,7 +85,7 @@ def _identities(paths: Iterable[str]) -> dict[str, Identity | None]:
 
 @dataclass(frozen=True)
 class Change:
-    """What changed files mean."""
+    """The meaning of changed files for the running dataflow."""
 
     prepared: Prepared
     steps: tuple[Step, ...] = ()
@@ -115,7 +115,7 @@ class Sources:
         self._environment = environment
 
     def look(self, current: Prepared, changed: Collection[str], versions: Versions) -> Change:
-        """What the files `changed` mean for the running version `current`.
+        """Decide what the files `changed` mean for the running version `current`.
 
         versions: of the files that the nodes run. Blocks: do not call it in the loop's thread.
         Raises DoraSystemdError if a file is not valid; then nothing should be changed.
@@ -205,7 +205,7 @@ class Sources:
 
 
 def _stubborn(steps: Iterable[Step], operators: Mapping[str, Mapping[str, str]]) -> str:
-    """Why dora cannot apply a change of an operator, or "": it reloads the operator's file only."""
+    """Return why dora cannot apply a change of an operator, or "": it reloads only its file."""
     for step in steps:
         if step.how is How.OPERATOR and step.file not in operators[step.node].values():
             return f"the operators of the node {step.node} import {Path(step.file).name}"
