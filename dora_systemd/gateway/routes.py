@@ -36,7 +36,7 @@ HEADERS = {
 
 
 def page_routes() -> dict[str, Get]:
-    """One route for each file of the page."""
+    """Return a route for each file of the page."""
     names = sorted(path.name for path in DIRECTORY.iterdir() if path.suffix in TYPES)
     return {"/" if name == INDEX else f"{PREFIX}{name}": _answer_file for name in names}
 
@@ -60,7 +60,7 @@ async def answer_health(_request: Request) -> Answer:
 
 
 async def answer_metrics(request: Request) -> Answer:
-    """One snapshot of all dataflows for Prometheus. Raises DoraSystemdError without systemd."""
+    """Answer with the metrics of all dataflows. Raises DoraSystemdError without systemd."""
     text = await asyncio.to_thread(_metrics, request.scope)
     return Answer(200, CONTENT_TYPE, text.encode("utf-8", "replace"))
 

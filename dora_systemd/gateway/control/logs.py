@@ -80,7 +80,7 @@ def _read_logs(scope: Scope, request: Request, node: str) -> tuple[str, list[byt
 
 
 def _elsewhere(scope: Scope, uuid: str, node: str, now: int) -> list[Record]:
-    """Where more lines are, if the dataflow runs on several machines. node: "" for all."""
+    """Return records that name other machines with lines, if there are any. node: "" for all."""
     cell = find_if_loaded(scope, uuid)
     if cell is None or cell.options.machine or not cell.options.placed:
         return []

@@ -36,7 +36,7 @@ _FRESH_SECONDS = 5.0
 
 
 def list_dataflows(scope: Scope) -> dict[str, Any]:
-    """What is running, what has failed, and what ended last."""
+    """List running, failed and last ended dataflows."""
     rows = tuple(map(_row, read_cells(Bus(scope, for_reading=True))))
     return dataflow_list([*rows, *_ended(scope, rows, int(time.monotonic() / _FRESH_SECONDS))])
 
@@ -52,7 +52,7 @@ def _row(cell: Cell) -> DataflowRow:
 
 
 def list_nodes(scope: Scope) -> dict[str, Any]:
-    """All nodes of all running dataflows, with their resource usage."""
+    """List all nodes of all running dataflows, with their resource usage."""
     return node_list(read_rows(Bus(scope, for_reading=True), scope))
 
 
@@ -91,7 +91,7 @@ def check(scope: Scope, uuid: str) -> dict[str, Any]:
 
 
 def ended_result(scope: Scope, uuid: str) -> dict[str, Any]:
-    """How a dataflow has ended, with the last lines of the node. Raises DoraSystemdError."""
+    """Return the reply for an ended dataflow, with the node's last lines, or raise its error."""
     report = explain(Bus(scope, for_reading=True), scope, uuid, JournalReader())
     failed = report.verdict.status == FAILED
     failures = {report.verdict.node or report.subject.name: _account(report)} if failed else {}

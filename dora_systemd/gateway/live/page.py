@@ -47,7 +47,7 @@ _STREAMS = ("follow", "find", "unfollow")
 
 
 class Means(NamedTuple):
-    """How a page is served."""
+    """The parameters by which a page is served."""
 
     interval: float = INTERVAL_SECONDS  # seconds between snapshots, at least
     send_seconds: float = 10.0  # until a page that accepts no data is given up, not queued for ever
