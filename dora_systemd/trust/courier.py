@@ -125,7 +125,7 @@ def content(path: str) -> Iterator[bytes]:
 
 
 def git(command: tuple[str, ...], safe: str) -> bytes | None:
-    """What a git command prints, None if it fails."""
+    """Return the output of a git command, None if it fails."""
     trusted = ("-c", f"safe.directory={safe}") if safe else ()
     # A hook of git has variables that lead to another repository.
     own = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
@@ -145,7 +145,7 @@ def git(command: tuple[str, ...], safe: str) -> bytes | None:
 def printed(
     child: "subprocess.Popen[bytes]", seconds: float = _GIT_SECONDS, most: int = MOST_PRINTED
 ) -> bytes | None:
-    """What a child prints, None if it fails or is late. Raises OSError if that is too much."""
+    """Return the output of a child, None if it fails or is late. Raises OSError for too much."""
     assert child.stdout
     late = threading.Timer(seconds, child.kill)
     late.start()
@@ -220,7 +220,7 @@ def frame(letter: bytes, data: bytes = b"") -> None:
 
 
 def reason(error: OSError | ValueError) -> bytes:
-    """Why a request failed, and in a second line the path that did."""
+    """Format why a request failed, and in a second line the path."""
     text = str(getattr(error, "strerror", None) or error)[:200]
     path = getattr(error, "filename", None)
     return f"{text}\n{path if isinstance(path, str) else ''}".encode("utf-8", "surrogateescape")

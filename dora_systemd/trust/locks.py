@@ -86,7 +86,7 @@ def _open_again(found: int) -> int:
 
 
 def _at_lock(directory: Path, use: Callable[[int], T]) -> T | None:
-    """What `use` makes of a descriptor (O_PATH) of the lock file. Raises as find_lock()."""
+    """Call `use` with a descriptor (O_PATH) of the lock file. Raises as find_lock()."""
     path = CellPaths(directory).lock
     try:
         with reached(directory) as (parent, place):

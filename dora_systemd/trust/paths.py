@@ -55,7 +55,7 @@ class Place(NamedTuple):
 
     @property
     def changeable(self) -> str:
-        """How others than root can have changed it, or "" if none can. A group counts as others."""
+        """How other users than root can have changed the file, or "". A group counts as others."""
         if self.uid != 0:
             return "the file is not root's"
         if self.borrowed:
@@ -79,7 +79,7 @@ class Place(NamedTuple):
 
 
 def hint_of_changeable(path: Path, roots: Path, otherwise: str) -> str:
-    """What root does about a file that others can change.
+    """Return the hint about a file that others than root can change.
 
     roots: the file that root is meant to write. otherwise: what to do instead of using another one.
     """

@@ -44,7 +44,7 @@ _LONGEST = 4096
 
 
 class Patience:
-    """How long we wait for a child in all. left: seconds, which it earns by what it sends.
+    """The total time to wait for a child. left: seconds, which the child earns by sending data.
 
     most: seconds for each frame.
     """

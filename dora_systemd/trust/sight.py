@@ -34,7 +34,7 @@ _CHUNK = 65536
 
 
 class Sight:
-    """What an account sees of the file system: here the caller. All paths are absolute."""
+    """The file system as an account sees it, here the caller. All paths are absolute."""
 
     def exists(self, path: str) -> bool:
         """Whether something exists there."""
@@ -76,7 +76,7 @@ class Sight:
         return [one for one in found.split("\0") if one and "/" not in one and one != ".."]
 
     def modified_ns(self, path: str) -> int:
-        """When the file was last written, ns since 1970; 0 if there is none."""
+        """Return when the file was last written, ns since 1970; 0 without a file."""
         with contextlib.suppress(OSError, ValueError):
             found = self._ask(b"m", path)
             return int(found) if len(found) <= _MOST_TIME_DIGITS else 0
@@ -134,7 +134,7 @@ class LentSight(Sight):
 
 @contextlib.contextmanager
 def sight_of(account: Account | None, seconds: float = _SECONDS) -> Iterator[Sight]:
-    """How the account sees paths; as the caller does for None, or if the caller is not root.
+    """Open the Sight of an account; that of the caller for None, or if the caller is not root.
 
     seconds: timeout for all answers together. Raises DoraSystemdError (NO_PERMISSION) if the
     account cannot execute our Python interpreter.

@@ -14,7 +14,7 @@ _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 def strange_part(directory: str | Path) -> str:
-    """What others than root can change in a directory or on the way to it, and why; or "".
+    """Find what others than root can change in a directory or on the way to it, and why; or "".
 
     A directory that does not exist is one that root makes: then the way to it is all.
     """
