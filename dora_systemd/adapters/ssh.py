@@ -40,7 +40,7 @@ def start_here(command: str, **streams: Any) -> "subprocess.Popen[bytes]":
 
 
 def read_now(fd: int, size: int = 1 << 16) -> bytes | None:
-    """What can be read without waiting; b"" at the end, None if there is nothing now."""
+    """Read what is available without waiting; b"" at the end, None if there is nothing now."""
     with suppress(BlockingIOError):
         return os.read(fd, size)
     return None
@@ -105,7 +105,7 @@ class Connection:
         self.ended = os.pidfd_open(self._child.pid)
 
     def read(self, fd: int) -> bytes | None:
-        """As read_now()."""
+        """Read from a stream as read_now() does."""
         return read_now(fd)
 
     @property

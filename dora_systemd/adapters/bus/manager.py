@@ -116,7 +116,7 @@ class Manager(Protocol):
         """The units whose jobs the job of this unit waits for; [] if it has none (any more)."""
 
     def began_us(self) -> int:
-        """When this manager began, CLOCK_MONOTONIC µs: at boot, or at the user's first login."""
+        """Return when the manager began, CLOCK_MONOTONIC µs: at boot, or at the first login."""
 
     def control_group(self) -> str:
         """The manager's own cgroup, which contains its units; "" is the root."""

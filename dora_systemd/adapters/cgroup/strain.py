@@ -23,7 +23,7 @@ def read_strain(path: Path) -> Strain:
 
 
 def read_oom(path: Path) -> OomCounts:
-    """How often the kernel has killed in a group, and how often its own limit was the reason."""
+    """Count the kernel's OOM kills in a group, and those because of the group's own limit."""
     return OomCounts(
         read_numbers(f"{path}/memory.events").get("oom_kill", 0),
         read_numbers(f"{path}/memory.events.local").get("oom", 0),
@@ -44,7 +44,7 @@ def read_load(path: Path) -> Load:
 
 
 def _read_stalls(path: str) -> tuple[int, int] | None:
-    """Both totals of a pressure file in µs; None if the kernel does not measure them."""
+    """Read both totals of a pressure file in µs; None if the kernel does not measure them."""
     totals = {kind: int(total) for kind, _, total in _PRESSURE.findall(read_text(path))}
     return (totals["some"], totals.get("full", 0)) if "some" in totals else None
 

@@ -40,7 +40,7 @@ def run_dora(
 
 
 def refusal_reason(done: Completed) -> str:
-    """Why a dora command has failed, in one line."""
+    """Return why a dora command has failed, in one line."""
     return parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
 
 

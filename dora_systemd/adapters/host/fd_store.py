@@ -42,7 +42,7 @@ def lives() -> int:
 
 
 def life_times() -> list[int]:
-    """When the lives began that lives() counts, CLOCK_BOOTTIME µs, oldest first."""
+    """Read when the lives began that lives() counts, CLOCK_BOOTTIME µs, oldest first."""
     return sorted(map(_read_time, _lives()))
 
 

@@ -14,7 +14,7 @@ _MOST_LINKS = 40
 
 
 class Presence(NamedTuple):
-    """What is at a path. reason: why it cannot be used, or "". identity: of a device.
+    """The state of a path. reason: why it cannot be used, or "". identity: of a device.
 
     A device that was unplugged and plugged in between two looks has another identity.
     """
@@ -24,7 +24,7 @@ class Presence(NamedTuple):
 
 
 def look_at(path: str) -> Presence:
-    """What is at `path`, behind links."""
+    """Check what is at `path`, behind links."""
     try:
         found = Path(path).stat()
     except PermissionError:

@@ -25,7 +25,7 @@ _FLOCK = re.compile(rb"\d+: FLOCK +\S+ +(?:READ|WRITE) +(\d+) ([0-9a-f]+:[0-9a-f
 
 
 def read_processes(proc: Path = PROC) -> list[Process]:
-    """All readable processes, without kernel threads."""
+    """Read all readable processes, without kernel threads."""
     found = (_read_process(path) for path in proc.glob("[0-9]*"))
     return sorted((one for one in found if one), key=lambda one: one.pid)
 
@@ -126,7 +126,7 @@ def read_flocks(device: int) -> Mapping[int, tuple[int, ...]]:
 
 
 def read_lock_process(pid: int) -> LockProcess:
-    """What the kernel knows of a process; for one that has gone, its pid only. uid: -1 then."""
+    """Read the facts of a process; of an ended process only the pid, with uid -1."""
     path = PROC / str(pid)
     with suppress(OSError, ValueError, KeyError, IndexError):
         read = (beginning(path / one, _MOST_OF_PROCESS) for one in ("cmdline", "cgroup", "status"))

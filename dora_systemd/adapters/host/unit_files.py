@@ -33,7 +33,7 @@ def read_unit_file(path: Path) -> str | None:
 
 
 def written_us(path: Path) -> int:
-    """When a unit file was written, CLOCK_REALTIME µs; 0 if there is none."""
+    """Return when a unit file was written, CLOCK_REALTIME µs; 0 if there is none."""
     try:
         return path.lstat().st_mtime_ns // 1000
     except OSError:
@@ -77,7 +77,7 @@ def write_unit_file(path: Path, text: str) -> None:
 
 
 def remains_of(path: Path) -> list[Path]:
-    """What a process that was killed while it wrote this unit file has left, see write_atomic()."""
+    """Find what a process left that was killed while writing this unit file, see write_atomic()."""
     found = []
     # Not .NAME.swp: an editor's file has unsaved work of a person.
     for one in path.parent.glob(f".{path.name}.{_RANDOM}"):

@@ -74,7 +74,7 @@ def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
 
 
 def journal_output(arguments: Sequence[str], want_colors: bool = False) -> Iterator[bytes]:
-    """What journalctl prints, in chunks. Raises DoraSystemdError for its error message."""
+    """Yield the output of journalctl, in chunks. Raises DoraSystemdError for its error message."""
     with open_journalctl(arguments, want_colors) as child:
         assert child.stdout
         while data := os.read(child.stdout.fileno(), CHUNK):

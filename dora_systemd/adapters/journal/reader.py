@@ -91,7 +91,7 @@ class JournalReader:
         self._bounds = bounds
 
     def unique(self, field: str) -> list[str]:
-        """All values of `field` in the journal, sorted."""
+        """Return all values of `field` in the journal, sorted."""
         lines = _lines([f"--field={field}", "--quiet"], self._bounds)
         return sorted(line.decode("utf-8", "replace").rstrip("\n") for line in lines)
 
@@ -203,7 +203,7 @@ class JournalReader:
 
 
 def read_when_written(read: Callable[[], T], is_behind: Callable[[T], bool]) -> T:
-    """What `read` gives. It is read again for a moment while journald is behind with it."""
+    """Call `read`, again for a moment while journald has not yet written what is expected."""
     deadline = time.monotonic() + _MOST_BEHIND
     found = read()
     while time.monotonic() <= deadline and is_behind(found):
@@ -282,7 +282,7 @@ def is_volatile(root: Path | None = None) -> bool:
 
 
 def place_since(start_us: int, root: Path | None = None) -> Place:
-    """Where journald has written since its start, CLOCK_REALTIME µs. root: as ROOT.
+    """Find where journald has written since its start, CLOCK_REALTIME µs. root: as ROOT.
 
     It writes a record when it starts, and sets the time of a file that it has written to.
     """

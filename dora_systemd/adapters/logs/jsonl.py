@@ -89,7 +89,7 @@ class JsonlTail:
 
     @property
     def loss(self) -> str:
-        """Why lines are lost, or "". Their number is unknown, because dora does not count them."""
+        """The reason why lines are lost, or "". dora does not count lost lines."""
         if not self.lost_files:
             return ""
         return f"dora deleted {self.lost_files} of its log files before they were read"

@@ -119,7 +119,7 @@ class Source:
         return batch
 
     def admit(self, stream: str, count: int, now: float) -> int:
-        """How many of `count` lines that have arrived at `now` (seconds) may pass."""
+        """Return how many of `count` lines may pass that arrived at `now` (seconds) may pass."""
         return count if self.limiter is None else self.limiter.admit(stream, count, now)
 
 

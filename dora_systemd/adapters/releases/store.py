@@ -66,12 +66,12 @@ class Store:
         return self.release(release_id) / TREE
 
     def known(self) -> list[Known]:
-        """All releases, oldest first; those that this user may not enter count as not proved."""
+        """Return all releases, oldest first; unreadable ones count as not proved."""
         found = sorted(filter(is_release_id, self._names()))
         return [Known(one, self.is_proved(one)) for one in found]
 
     def unfinished(self) -> list[Path]:
-        """What a deploy that was killed has left: a release gets its unit file last."""
+        """Find what a killed deploy has left: a release gets its unit file last."""
         return sorted(self.path / name for name in self._names() if self._is_unfinished(name))
 
     def manifest(self, release_id: str) -> Manifest:

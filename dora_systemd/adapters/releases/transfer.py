@@ -168,7 +168,7 @@ def _begin(store: Store) -> Draft:
 
 
 def leftovers(root: Path) -> list[Path]:
-    """What a doractl that was killed has left there."""
+    """Find what a killed doractl has left in the shared directory."""
     return [path for path in Store(root, _NAME).unfinished() if not _is_used(path)]
 
 

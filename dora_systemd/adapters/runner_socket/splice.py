@@ -9,7 +9,7 @@ _CHUNK = 1 << 16
 
 
 class Transport(Protocol):
-    """What is used of an asyncio.WriteTransport."""
+    """The methods of asyncio.WriteTransport that are used."""
 
     def abort(self) -> None: ...
 
@@ -17,7 +17,7 @@ class Transport(Protocol):
 
 
 class Writer(Protocol):
-    """What is used of an asyncio.StreamWriter."""
+    """The methods of asyncio.StreamWriter that are used."""
 
     @property
     def transport(self) -> Transport: ...
