@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class ExitKind(Enum):
-    """What ended a process. The value is the beginning of the text."""
+    """The kind of end of a process. The value is the beginning of the text."""
 
     OTHER = ""
     CODE = "exit code "

@@ -83,7 +83,7 @@ def has_launcher(node: Node) -> bool:
 
 
 def kinds(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, str]:
-    """How each node is started, in the terms of the live table."""
+    """Return how each node is started, in the terms of the live table."""
     return {node.id: _kind(node, plan) for node in dataflow.nodes}
 
 
@@ -228,7 +228,7 @@ def _find(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
 
 
 def _hint(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
-    """What to do about a program that is not there."""
+    """Return the hint for a missing program."""
     if node.build:
         return _build_hint(source, plan)
     places = dict.fromkeys((directory, plan.options.working_directory))
@@ -244,7 +244,7 @@ def _build_hint(source: str, plan: LaunchPlan) -> str:
 
 
 def _uv_places(directory: str, plan: LaunchPlan) -> list[str]:
-    """Where `uv run which` looks first, by which dora finds programs."""
+    """Return where `uv run which` searches first, by which dora finds programs."""
     project = uv_project(directory, plan.read) if plan.options.uv else None
     return [str(PurePath(project, ".venv", "bin"))] if project else []
 

@@ -142,7 +142,7 @@ def parse_node_need(text: str) -> NodeNeed:
 
 
 def paths_by_node(needs: Sequence[NodeNeed]) -> dict[str, tuple[str, ...]]:
-    """All paths that each node needs, in their order."""
+    """Return the paths that each node needs, in their order."""
     found: dict[str, tuple[str, ...]] = {}
     for node, path in needs:
         found[node] = (*found.get(node, ()), path)

@@ -163,7 +163,7 @@ def _check_output(owed: Owed, node: Node) -> None:
 
 
 def _no_restart(node: Node, own: RestartPolicy | None) -> str:
-    """Why dora would not restart the node, or ""."""
+    """Return why dora would not restart the node, or ""."""
     if node.kind in _NEVER_RESTARTED:
         return _NEVER_RESTARTED[node.kind]
     is_never = node.restart_policy == "never" if own is None else own.policy == "no"

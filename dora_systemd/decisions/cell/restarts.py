@@ -187,7 +187,7 @@ class Budget(NamedTuple):
 def unit_budget(
     starts: Sequence[int], max_restarts: int, window: int, now: int, counted: int
 ) -> Budget:
-    """How much of the budget is used up.
+    """Return how much of the budget is used up.
 
     starts: CLOCK_REALTIME µs of the starts of the unit, oldest first: one by hand, and the
     automatic restarts since. counted: NRestarts=, which `doractl reset` clears.
@@ -200,7 +200,7 @@ def unit_budget(
 
 
 def count_restarts(starts: Sequence[int], window: int) -> tuple[int | None, int]:
-    """When the last window began, and the restarts in it. starts: as for unit_budget().
+    """Return when the last window began, and the restarts in it. starts: as for unit_budget().
 
     As in systemd, a window begins with a start and lasts `window` µs; the next start after its end
     begins another window.

@@ -206,7 +206,7 @@ _PROGRAMS = "/usr/bin"
 
 @dataclass(frozen=True)
 class Base:
-    """What all processes of the unit have: nice value, OOM score adjustment."""
+    """The rights of all processes of the unit: nice value, OOM score adjustment."""
 
     nice: int = 0
     oom: int = 0

@@ -32,7 +32,7 @@ def uv_project(directory: str, read: Read) -> str | None:
 
 
 def _projects(directory: PurePath, read: Read) -> Iterator[tuple[PurePath, _Workspace]]:
-    """Each directory with a pyproject.toml, from `directory` upwards."""
+    """Yield each directory with a pyproject.toml, from `directory` upwards."""
     for place in (directory, *directory.parents):
         try:
             data = read(str(place / "pyproject.toml"))

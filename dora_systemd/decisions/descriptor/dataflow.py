@@ -111,7 +111,7 @@ def _check_wiring(dataflow: Dataflow) -> None:
 
 
 def _missing(source: str, nodes: Mapping[str, Node]) -> str:
-    """What is wrong with the source of an input, or ""."""
+    """Return what is wrong with the source of an input, or ""."""
     origin, slash, output = source.partition("/")
     if source.startswith(_DORA_SOURCES):
         return ""

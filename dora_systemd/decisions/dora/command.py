@@ -60,7 +60,7 @@ class NodeCommand(NamedTuple):
 
     @property
     def told(self) -> str:
-        """What dora prints for it."""
+        """The text that dora prints for the command."""
         return _TOLD[self.what].format(self.node)
 
 

@@ -35,7 +35,7 @@ def parse_dora_error(stderr: str) -> str:
 
 
 def _nearest(choices: re.Match[str]) -> str:
-    """What was written, with the one of many choices that it was meant to be."""
+    """Return the written value with the nearest of many choices."""
     near = did_you_mean(choices[1], re.findall("`([^`]*)`", choices[2]))
     return f"`{choices[1]}`" + (f" ({near})" if near else "")
 

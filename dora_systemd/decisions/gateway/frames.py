@@ -160,7 +160,7 @@ def renamed(value: Any, old: str, new: str) -> Any:
 
 
 def refused_version(version: object) -> str | None:
-    """Why the gateway refuses a dora command of that version, or None."""
+    """Return why the gateway refuses a dora command of that version, or None."""
     text = version if isinstance(version, str) else ""
     if text.partition(".")[0] == "1":
         return None

@@ -84,7 +84,7 @@ _WORDS = {
 
 
 def setup_failure(status: int) -> str:
-    """What systemd could not do before it executed a process, "" for another exit status.
+    """Return what systemd could not do before it executed a process, "" for another exit status.
 
     As "its sandbox could not be set up (exit code 226/NAMESPACE)".
     """

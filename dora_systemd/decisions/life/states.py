@@ -80,7 +80,7 @@ Action = Do | Record | Deadline
 
 @dataclass(frozen=True)
 class Cell:
-    """All that the runner knows of its cell. Moments (_us) are in µs of CLOCK_REALTIME."""
+    """The state of a cell, as its runner knows it. Moments (_us) are in µs of CLOCK_REALTIME."""
 
     grace: int  # µs
     started_us: int

@@ -21,7 +21,7 @@ def step(cell: Cell, event: life.Event) -> Next:
 
 
 def _row(**handlers: Handler) -> dict[type[life.Event], Handler]:
-    """One line of the table: events that are not named have no effect in that state."""
+    """Build one line of the table: events that are not named have no effect in that state."""
     assert handlers.keys() <= {event.__name__ for event in life.EVENTS}
     return {event: handlers.get(event.__name__, handle.ignore) for event in life.EVENTS}
 

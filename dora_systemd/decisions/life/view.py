@@ -40,7 +40,7 @@ _NAMED = 5
 
 
 def format_status(cell: Cell) -> str:
-    """One line for STATUS=, see sd_notify(3)."""
+    """Format one line for STATUS=, see sd_notify(3)."""
     if cell.failure:
         return f"{FAILED_BECAUSE}{cell.failure}"
     if text := _format_gathering(cell) or _SHOWN[cell.state][1]:
@@ -53,7 +53,7 @@ def format_status(cell: Cell) -> str:
 
 
 def _format_gathering(cell: Cell) -> str:
-    """What a machine waits for before there is a run; "" otherwise."""
+    """Format what a machine waits for before its run; "" otherwise."""
     if cell.machine and cell.state in (State.BOOTING, State.GATHERING):
         return "waiting for the head"
     if cell.state is not State.GATHERING:
@@ -100,7 +100,7 @@ def _format_running(cell: Cell) -> str:
 
 
 def _format_lacking(cell: Cell) -> str:
-    """As "camera waits for /dev/video0 since 14:02:11 UTC"."""
+    """Format "camera waits for /dev/video0 since 14:02:11 UTC"."""
     nodes = lacking(cell.nodes).items()
     return _names([format_wait(ident, node.needs, node.since_us) for ident, node in nodes])
 
@@ -119,7 +119,7 @@ def _count(cell: Cell, *states: str) -> int:
 
 
 def stage(cell: Cell) -> str:
-    """One of dora_systemd.decisions.cell.status.STAGES."""
+    """Return the stage, one of dora_systemd.decisions.cell.status.STAGES."""
     if cell.state is State.RUNNING and any(map(_is_missed, cell.nodes.values())):
         return "degraded"
     if lacking(cell.nodes) and has_started(cell):

@@ -28,7 +28,7 @@ def encode_entry(fields: Mapping[str, Value]) -> bytes:
 
 
 def _encode_field(name: str, value: Value) -> bytes:
-    """One field; a value with a newline needs the form with a 64-bit little-endian length."""
+    """Encode one field, for a value with a newline with a 64-bit little-endian length."""
     data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogateescape")
     key = name.encode("ascii")
     if b"\n" in data:

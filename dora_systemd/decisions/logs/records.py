@@ -92,7 +92,7 @@ def record_text(record: Record, name: str) -> str:
 
 
 def timestamp(record: Record) -> str:
-    """When journald got it, as in RFC 3339, in UTC."""
+    """Format when journald received a record, as in RFC 3339, in UTC."""
     return format_moment(int(record.get("__REALTIME_TIMESTAMP", b"0")))
 
 

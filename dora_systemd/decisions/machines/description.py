@@ -51,7 +51,7 @@ def _clock(value: object) -> int:
 
 
 def problems(here: Facts, there: Facts, skew: int) -> Iterator[tuple[str, str]]:
-    """What keeps the machine from being a member, and hints. skew: of its clock, in µs."""
+    """Yield what prevents the machine from being a member, and hints. skew: of its clock, in µs."""
     for program, own, other in (
         ("dora-systemd", here.doractl, there.doractl),
         ("dora", here.dora, there.dora),
@@ -80,6 +80,6 @@ def required(found: Iterator[tuple[str, str]], machine: str) -> None:
 
 
 def summary(facts: Facts, skew: int) -> Mapping[str, str]:
-    """What to show of a machine that can be a member."""
+    """Return what is shown of a machine that can be a member."""
     clock = f"{skew / 1000:+.0f} ms"
     return {"dora-systemd": facts.doractl, "dora": facts.dora, "user": facts.user, "clock": clock}

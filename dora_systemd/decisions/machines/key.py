@@ -38,7 +38,7 @@ def authorized_line(program: str, public: str, comment: str) -> str:
 
 
 def key_text(public: str) -> str:
-    """What is in no other key. Raises DoraSystemdError (BAD_INPUT) for what is no public key."""
+    """Return the unique part of a public key, or raise DoraSystemdError (BAD_INPUT)."""
     return _public(public).split()[1]
 
 

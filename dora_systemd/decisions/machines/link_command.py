@@ -60,7 +60,7 @@ def link_command(python: str, link: LinkOptions) -> list[str]:
 
 
 def relay_command(python: str, runner: int, lease: float) -> list[str]:
-    """What takes the place of `doractl member`. runner: file descriptor. lease: in seconds."""
+    """Return the command that replaces `doractl member`. runner: descriptor. lease: seconds."""
     return [python, *_QUICK, str(_PROGRAMS / "relay.py"), str(runner), f"{lease:g}"]
 
 

@@ -87,7 +87,7 @@ def links_pattern(name: str) -> str:
 
 
 def wanted_links(options: RunnerOptions) -> dict[str, Property]:
-    """What the unit of the head needs: its start, by whomever, starts the links."""
+    """Return the properties of the head's unit by which any start of it starts the links."""
     links = tuple(link_units_of(options))
     return typed(Wants=links) if links else {}
 

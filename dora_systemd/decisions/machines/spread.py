@@ -233,7 +233,7 @@ def _check(options: RunnerOptions, settings: Settings) -> None:
 
 
 def _refused(options: RunnerOptions, settings: Settings) -> Iterator[tuple[str, str]]:
-    """What is not possible on several machines, and a hint."""
+    """Yield what is not possible on several machines, and hints."""
     away = {one.node: one.machine for one in options.placed}
     if options.attached:
         yield "doractl run has one machine only", "use doractl start --attach"

@@ -37,7 +37,7 @@ class NodeUse(NamedTuple):
 
 
 def told_use(use: Usage, samples: tuple[CpuSample, ...], now: CpuSample, node: str) -> list[Any]:
-    """What a member writes into its table for parse_use(). now: the reading that `use` is from."""
+    """Return what a member writes into its table for parse_use(). now: the reading with `use`."""
     shares = (cpu_percent(samples, now, node), throttled_percent(samples, now, node))
     limits = (use.memory, use.memory_peak, use.memory_max, use.cpu_max)
     counters = (use.cpu_us, *use.throttling)

@@ -10,7 +10,7 @@ _WITH_PROGRAM = ("starting", "ready", "running", "restarting")
 
 
 class Do(Enum):
-    """What to do with a node."""
+    """The step to take for a node."""
 
     HOLD = "wait"
     """The launcher of the node waits already: only show the wait."""

@@ -28,7 +28,7 @@ BEATS = 2
 
 @dataclass(frozen=True)
 class Look:
-    """What is known at one moment."""
+    """The facts that are known at one moment."""
 
     # at_us, beat_us, `heard`: CLOCK_MONOTONIC, 0 is never
     at_us: int
@@ -40,7 +40,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Ear:
-    """What is known of one owed output. Times in µs."""
+    """The state of one owed output. Times in µs."""
 
     life: int = 0  # when the process that owes it became ready, 0 if none runs
     heard: int = 0  # the last message

@@ -96,7 +96,7 @@ NO_FEEDS = Feeds()
 
 @dataclass(frozen=True)
 class Flow:
-    """What is known of one input. Times in µs."""
+    """The state of one input. Times in µs."""
 
     heard: int = 0  # its last message, CLOCK_MONOTONIC
     steady: int = 0  # how long messages came without a gap longer than `within`

@@ -48,7 +48,7 @@ _UNSUPPORTED = (
 
 
 class Newer(NamedTuple):
-    """What a systemd has, to judge what the table does not know."""
+    """The version and keys of a systemd, to judge properties that the table does not contain."""
 
     version: int
     types: Mapping[str, str]  # signatures of a service's properties by name on D-Bus

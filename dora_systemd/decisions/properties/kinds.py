@@ -42,7 +42,7 @@ class Property(NamedTuple):
 
 @dataclass(frozen=True)
 class PropertyKind:
-    """How a value is parsed and formatted."""
+    """Functions to parse and format the values of a kind."""
 
     signature: str
     expected: str  # a description for hints
@@ -99,7 +99,7 @@ def number_kind(signature: str, lowest: int, highest: int) -> PropertyKind:
 
 
 def choice_kind(*choices: str) -> PropertyKind:
-    """One of some words; if "yes" and "no" are among them, all boolean words are valid."""
+    """Return the kind of some words; with "yes" and "no", all boolean words are valid."""
     kind = replace(word_kind("s", {choice: choice for choice in choices}), is_choice=True)
     if not {"yes", "no"} <= {*choices}:
         return kind

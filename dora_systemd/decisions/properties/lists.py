@@ -81,7 +81,7 @@ def _format_filter(value: tuple[bool, Sequence[str]]) -> str:
 
 
 def _parse_fields(text: str) -> tuple[bytes, ...]:
-    """One field as for systemd-run, or several quoted ones as in unit files."""
+    """Parse one field as for systemd-run, or several quoted fields as in unit files."""
     field = plain_text(text)
     fields = WORDS.parse(field) if field.startswith('"') else (field,) if field else ()
     if not all(_FIELD.match(one) for one in fields):

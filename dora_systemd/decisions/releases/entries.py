@@ -105,7 +105,7 @@ def refusal(path: str, reason: str, hint: str) -> DoraSystemdError:
 
 
 def _trouble_of_link(path: str, target: str) -> str:
-    """Why a link could lead out of the project, or "".
+    """Return why a link could lead out of the project, or "".
 
     ".." behind a name is refused as well: the name may be a link itself, and then it is unknown
     where ".." leads.

@@ -46,7 +46,7 @@ class Parcel:
 
     @property
     def contents(self) -> list[Stored]:
-        """One file for each content, in the order of their numbers."""
+        """A file for each content, in the order of their numbers."""
         return list({one.digest: one for one in self.files.values() if not one.target}.values())
 
 

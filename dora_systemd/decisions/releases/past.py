@@ -39,7 +39,7 @@ class Switch(NamedTuple):
 
 
 def format_switch(one: Switch) -> bytes:
-    """One line of the file."""
+    """Format a change as one line of the file."""
     value = {
         "at_us": one.at_us,
         "from": one.former,
@@ -71,7 +71,7 @@ def completed(history: Sequence[Switch], current: str, at_us: int = 0) -> list[S
 
 
 def how_of(history: Sequence[Switch], release: str, known: Collection[str] = ()) -> str:
-    """Why the present release ends when `release` takes its place.
+    """Return why the present release ends when `release` replaces it.
 
     known: as of runs().
     """
@@ -118,7 +118,7 @@ def ends(history: Sequence[Switch]) -> dict[str, Switch]:
 
 
 def begins(history: Sequence[Switch]) -> dict[str, int]:
-    """When each release began to run the last time, in µs."""
+    """Return when each release last began to run, in µs."""
     found: dict[str, int] = {}
     for one in history:
         if one.release and one.former != one.release:

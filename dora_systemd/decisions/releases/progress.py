@@ -30,7 +30,7 @@ class Step(NamedTuple):
 
     @property
     def news(self) -> tuple[object, ...]:
-        """What differs in two steps that are both worth a line at once."""
+        """The values by which two steps differ that are both worth a line at once."""
         return self.stage, self.nodes, self.is_last
 
 
@@ -119,7 +119,7 @@ def judged(release: str, reason: str) -> Step:
 
 
 def going_back(release: str, status: str) -> Step:
-    """What ran before starts again. release: "" if that is none."""
+    """Return the step that starts the former dataflow. release: its release, or ""."""
     words = f": {status}" if status else ""
     return Step(BACK, f"going back to {release or 'what ran before'}{words}", nodes=_count(status))
 

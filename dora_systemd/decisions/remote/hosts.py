@@ -138,7 +138,7 @@ def quote(word: str) -> str:
 
 
 def remote_command(way: Way, words: Sequence[str], mark: str = "", host: Host | None = None) -> str:
-    """What the login shell of the host runs. mark: printed first, if not TERMINAL.
+    """Return what the login shell of the host runs. mark: printed first, if not TERMINAL.
 
     host: as which a person has named it, for whom hints are then.
     """

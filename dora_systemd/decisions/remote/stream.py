@@ -17,7 +17,7 @@ class AfterMark:
         self.is_open = False
 
     def feed(self, data: bytes) -> bytes:
-        """What comes after the mark."""
+        """Return the bytes after the mark."""
         if self.is_open:
             return data
         before, mark, after = (self.noise + data).partition(self._mark)

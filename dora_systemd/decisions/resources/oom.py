@@ -39,7 +39,7 @@ class Oom:
 
     @property
     def text(self) -> str:
-        """How the node ended, for the live table."""
+        """The end of the node, for the live table."""
         peak, limit = format_rounded_size(self.peak), format_rounded_size(self.limit)
         if self.owner is Owner.NODE:
             return f"out of memory, peak {peak}, limit {limit}"

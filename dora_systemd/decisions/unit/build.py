@@ -44,7 +44,7 @@ def build_properties(
     timeout: int,
     is_user: bool,
 ) -> dict[str, Property]:
-    """All properties but ExecStart= and standard input.
+    """Return all properties but ExecStart= and standard input.
 
     own: of the unit of the dataflow, without those of its runner. tree: the directory that is
     built, which the unit sees as `place`, below `releases`. timeout: µs.

@@ -60,7 +60,7 @@ def persistent_unit(
     target: str,
     is_checked: bool = False,
 ) -> str:
-    """One unit file equivalent to `texts` (a fragment and its drop-ins), wanted by `target`.
+    """Format one unit file equivalent to `texts` (a fragment and its drop-ins), wanted by `target`.
 
     A plain target does not wait for the dataflow: the dataflow starts after it. is_checked: a boot
     is good only if the dataflow comes up.

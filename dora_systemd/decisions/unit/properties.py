@@ -54,7 +54,7 @@ _ENDS_OF_ATTACHED = (RunnerExit.OK, RunnerExit.FAILED_AT_STOP)
 
 @dataclass(frozen=True)
 class UnitContext:
-    """What the unit needs besides the runner's options."""
+    """Values for the unit besides the runner's options."""
 
     python: str  # absolute path of the interpreter that runs dora-systemd itself
     is_user: bool  # whether the unit is one of a user's manager

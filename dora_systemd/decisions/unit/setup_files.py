@@ -47,7 +47,7 @@ _SYSTEM_ONLY = (
 
 
 def setup_files(is_user: bool, manuals: Iterable[str]) -> list[SetupFile]:
-    """All files of one scope. manuals: names of the existing manual pages."""
+    """Return all files of one scope. manuals: names of the existing manual pages."""
     common = [_BASH]
     common += [SetupFile(("man", one), f"share/man/man{one[-1]}/{one}") for one in sorted(manuals)]
     if is_user:

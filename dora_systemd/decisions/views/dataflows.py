@@ -200,7 +200,7 @@ _WITH_WHY = (WAITING, DEGRADED)
 
 
 def _why(row: DataflowRow) -> str:
-    """How it ended, what it waits for, or which nodes have failed."""
+    """Format how the dataflow ended, what it waits for, or which nodes have failed."""
     if row.status == DEGRADED:
         failed = (one for one in row.nodes if one.word == FAILED)
         return ", ".join(f"node {one.node}: {one.exit}" for one in failed)

@@ -99,7 +99,7 @@ def judge_rate(config: str, is_user: bool) -> Finding:
 
 
 def judge_port(port: int, owners: Sequence[Process], is_used: bool) -> Finding:
-    """What a dora command without doractl would connect to."""
+    """Judge what a dora command without doractl would connect to."""
     topic = f"port {port}"
     if not is_used:
         return Finding(topic, State.OK, "free")

@@ -229,6 +229,6 @@ def node_samples(fact: Fact, row: NodeRow) -> list[Sample]:
 
 
 def node_labels(row: NodeRow) -> Labels:
-    """What is special about a node; most have nothing."""
+    """Return labels for what is special about a node, usually nothing."""
     found = {one.key: one.of(row) for one in NODE_FACTS if one.is_label}
     return {key: "yes" if value is True else value for key, value in found.items() if value}

@@ -64,7 +64,7 @@ _KEEP = (
 
 
 class Place(StrEnum):
-    """Where journald has written since it was started."""
+    """The storage to which journald has written since its start."""
 
     DISK = "disk"
     MEMORY = "memory"
@@ -134,7 +134,7 @@ _BEST_GOVERNOR = "performance"
 
 @dataclass(frozen=True)
 class RealTime:
-    """What decides about real time on this machine."""
+    """The facts that decide about real time on this machine."""
 
     # whether CONFIG_RT_GROUP_SCHED of the kernel keeps realtime from the group of a node, whatever
     # root may have in its own; None: not known
@@ -147,7 +147,7 @@ class RealTime:
 
 
 def judge_real_time(facts: RealTime) -> Iterator[Finding]:
-    """What a node with a realtime priority would meet, and what would slow it down."""
+    """Judge what would prevent or slow down a node with a realtime priority."""
     yield _scheduling(facts)
     if facts.can_raise is False:
         text = "not even root can raise limits: no lock_memory, no nice or OOM score below 0"

@@ -27,7 +27,7 @@ class Inhibited(NamedTuple):
 
 
 def format_holder(holder: Holder) -> str:
-    """One holder in a line, such as "node arm (PID 231, user dora, python arm.py): it moves"."""
+    """Format one holder, such as "node arm (PID 231, user dora, python arm.py): it moves"."""
     details = (
         f"PID {holder.pid}" if holder.pid else "",
         f"user {holder.user}" if holder.user else "",
@@ -65,7 +65,7 @@ def _command(holder: Holder) -> str:
 
 
 def inhibited_objects(rows: Sequence[Inhibited]) -> list[Mapping[str, Any]]:
-    """What `doractl inhibit -o json` prints: an object for each lock."""
+    """Return what `doractl inhibit -o json` prints: an object for each lock."""
     return [
         {"name": row.name, "uuid": row.uuid, "unit": row.unit, **holder.values()}
         for row in rows

@@ -84,7 +84,7 @@ def _values(
 
 
 def error_object(error: DoraSystemdError) -> dict[str, Any]:
-    """What a command that fails prints, and the `error` of an outcome."""
+    """Return the object that a failing command prints, also the `error` of an outcome."""
     return {
         "message": error.message,
         "hint": error.hint or None,

@@ -19,7 +19,7 @@ class Subject(Named, Protocol):
 
 
 class Thing(NamedTuple):
-    """What is no dataflow: another unit, or "" for a file."""
+    """A subject that is no dataflow: another unit, or "" for a file."""
 
     unit: str = ""
     name: str = ""

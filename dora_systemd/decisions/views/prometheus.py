@@ -91,7 +91,7 @@ BUILD = Family("dora_systemd_build_info", "Version of dora-systemd; always 1.")
 
 
 def format_metrics(observed: Sequence[Observed], version: str) -> str:
-    """All metrics of these dataflows."""
+    """Format all metrics of these dataflows."""
     lines = list(_format(BUILD, "", [({"version": version}, 1)]))
     for prefix, families in (
         ("dora_dataflow_", _dataflow_samples(observed)),
@@ -141,7 +141,7 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
 
 
 def _place(node: NodeRow) -> Labels:
-    """Where it runs, unless that is here."""
+    """Return the label of the node's machine, if that is another one."""
     return {"machine": node.machine} if node.machine else {}
 
 

@@ -32,7 +32,7 @@ class ReleaseRow(NamedTuple):
 
     @property
     def why(self) -> str:
-        """Why no rollback chooses it by itself, or ""."""
+        """The reason why no rollback chooses the release by itself, or ""."""
         if self.state == UNPROVED:
             return self.end.reason if self.end else _UNENDED
         if self.state not in (FAILED, ROLLED_BACK) or not self.end:

@@ -43,7 +43,7 @@ class Line(NamedTuple):
 
 
 class Change(NamedTuple):
-    """What is to be done with a row. action: "stop" or "restart"."""
+    """A change to make to a row. action: "stop" or "restart"."""
 
     action: str
     row: TopRow

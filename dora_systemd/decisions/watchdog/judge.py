@@ -47,7 +47,7 @@ class Clock(NamedTuple):
 
 
 class Phase(Enum):
-    """What a node is doing. AWAY: nothing is expected of it."""
+    """The phase of a node. AWAY: no WATCHDOG=1 is expected."""
 
     AWAY = 0
     STARTING = 1
@@ -62,7 +62,7 @@ def limit_in(phase: Phase, watchdog: int, start_timeout: int) -> int:
 
 
 class Act(Enum):
-    """What to do to a node."""
+    """The action of a watchdog on a node."""
 
     NOTHING = "nothing"
     ABORT = "SIGABRT"
@@ -94,7 +94,7 @@ class Watch(NamedTuple):
         return self._replace(since=now)
 
     def act(self, limit: int, grace: int, now: int) -> Act:
-        """What the watchdog `limit` demands. grace: µs between SIGABRT and SIGKILL."""
+        """Return the action for the watchdog `limit`. grace: µs between SIGABRT and SIGKILL."""
         if self.aborted is None:
             is_late = self.is_awake and limit < INFINITY and now - self.since >= limit
             return Act.ABORT if is_late else Act.NOTHING

@@ -37,7 +37,7 @@ def parse_message(data: bytes) -> Message:
 
 
 def _clean(value: bytes) -> str:
-    """One line that cannot control a terminal: str.isprintable() knows such characters."""
+    """Clean a text to one line that cannot control a terminal, by str.isprintable()."""
     text = value.decode("utf-8", "replace")
     words = "".join(one if one.isprintable() else " " for one in text).split()
     return " ".join(words)[:MAX_STATUS]

@@ -59,7 +59,7 @@ def format_watchdogs(watchdogs: Watchdogs) -> list[str]:
 def merge_watchdogs(
     nodes: Mapping[str, Watchdogs], given: Watchdogs, sockets: Mapping[str, bool]
 ) -> dict[str, int]:
-    """What the runner gets. nodes: of settings files; `given` takes precedence over them.
+    """Merge watchdogs for the runner. nodes: of settings files; `given` takes precedence over them.
 
     sockets: whether nodes get a socket without a watchdog, with ALL_NODES. Raises DoraSystemdError
     (BAD_INPUT) for a time in `nodes` that has the form NODE=TIME itself.

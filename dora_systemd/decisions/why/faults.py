@@ -20,7 +20,7 @@ _HOW = {"node-watchdog": "hung, ", WAITING: "waits for "}
 
 
 class Fault(NamedTuple):
-    """Why a release has failed its trial."""
+    """The fault for which a release has failed its trial."""
 
     reason: str
     node: str = ""  # the first that failed, or ""

@@ -106,7 +106,7 @@ def _says_nothing(life: Life, facts: Facts) -> bool:
 
 
 def ended_word(life: Life, known: str = "") -> str:
-    """How a life ended. known: systemd's status, "" if it has unloaded the unit."""
+    """Return how a life ended. known: systemd's status, "" if it has unloaded the unit."""
     end = life.last(*_ENDS)
     if end is None:
         return FAILED if life.happenings else known or STOPPED
@@ -280,7 +280,7 @@ def _without_end(life: Life, facts: Facts) -> Verdict:
 
 
 def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
-    """What requested the end, if it is recorded."""
+    """Return who requested the end, if that is recorded."""
     asked = life.last("stop-asked")
     if asked is not None and asked.detail("by"):
         return asked.detail("by")

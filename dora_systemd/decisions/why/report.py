@@ -82,7 +82,7 @@ class Report:
 
 
 def remedies(report: Report) -> list[str]:
-    """What to do, one line each."""
+    """Return the remedies, one line each."""
     verdict, subject = report.verdict, report.subject
     lines = (one.text for one in report.words)
     hint = known_remedy(lines, report.node) if report.node else ""
@@ -130,7 +130,7 @@ def remedies(report: Report) -> list[str]:
 
 
 def _of_passing(report: Report) -> list[str]:
-    """What to do about a node that dora is about to restart: fix it, if it always ends so."""
+    """Return the remedy for a node that dora is about to restart and that ends again and again."""
     verdict = report.verdict
     has_helped = not any(one.node == verdict.node for one in verdict.restarts)
     if has_helped and not any(_HOPELESS.match(one.text) for one in report.words[-1:]):

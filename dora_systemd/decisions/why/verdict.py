@@ -40,7 +40,7 @@ class Restart:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What happened to a dataflow."""
+    """The verdict on a dataflow: what happened, and why."""
 
     status: str  # a word of `list`
     cause: Cause = Cause.NONE
