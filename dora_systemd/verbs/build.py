@@ -79,7 +79,7 @@ Show = Callable[[str], None]
 
 
 class Project(NamedTuple):
-    """What is built. user: who builds it, "" for the caller. lock: directory of uv.lock, or ""."""
+    """A project to build. user: who builds, "" for the caller. lock: uv.lock's directory, or ""."""
 
     dataflow: str
     user: str

@@ -103,7 +103,7 @@ def stop_slice(manager: Manager) -> list[str]:
 def processes_left(
     manager: Manager, others: Sequence[str], now: Callable[[], float] = time.monotonic
 ) -> list[str]:
-    """What is still running in dora.slice, as "process 12 (command)", without the units `others`.
+    """List what runs in dora.slice, as "process 12 (command)", without the units `others`.
 
     Kills these processes once more: with SendSIGKILL=no systemd leaves some behind.
     """

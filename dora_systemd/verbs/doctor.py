@@ -73,7 +73,7 @@ _BROKEN = ("bad-setting", "error")
 def examine(
     reach: Callable[[Scope], Manager], scope: Scope, root: Path = Path("/")
 ) -> list[Finding]:
-    """All findings. reach: opens the connection to systemd. root: has all files of the machine."""
+    """Yield all findings. reach: opens the connection to systemd. root: has all files."""
     try:
         manager = reach(scope)
         version = manager.version()

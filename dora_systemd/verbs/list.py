@@ -15,7 +15,7 @@ from dora_systemd.verbs.facts.selector import Selector
 
 
 def all_rows(manager: Manager, scope: Scope, cells: Iterable[Cell]) -> list[DataflowRow]:
-    """All that is known of those `cells` that are ours."""
+    """Return the complete rows of those `cells` that are ours."""
     return read_whole_rows(manager, scope, proven(cells))
 
 
@@ -36,7 +36,7 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
 
 
 def read_whole_rows(manager: Manager, scope: Scope, cells: Iterable[Cell]) -> list[DataflowRow]:
-    """All that is known of these dataflows."""
+    """Return the complete rows of these dataflows."""
     readings = [read_dataflow(manager, scope, cell) for cell in cells]
     return whole_rows(manager, scope, readings, [row_of(one) for one in readings])
 

@@ -91,7 +91,7 @@ def _oldest_first(query: LogQuery) -> LogQuery:
 
 
 class Span(NamedTuple):
-    """Where records are in the journal. first, last: times for journalctl. cursor: of the last."""
+    """A range of records in the journal. first, last: times for journalctl. cursor: of the last."""
 
     first: str
     last: str
@@ -99,7 +99,7 @@ class Span(NamedTuple):
 
 
 def find_span(query: LogQuery) -> Span | None:
-    """Where the records of a query are, None if there are none. Raises DoraSystemdError."""
+    """Find the range of the records of a query, None without records. Raises DoraSystemdError."""
     wanted = replace(query, output="export", cursor_file="", is_follow=False)
     if not query.is_counted:
         wanted = replace(wanted, tail="1")  # the last one, and --since is known
@@ -246,7 +246,7 @@ class FollowedLog(Follower):
 
 
 def unit_places(scope: Scope, environment: Mapping[str, str]) -> Iterator[Path]:
-    """Where transient units are, and where doractl enable writes units; see systemd.unit(5)."""
+    """Yield the directories of transient and of enabled units, see systemd.unit(5)."""
     yield scope.transient_units
     if not scope.is_user:
         yield Path("/etc/systemd/system")

@@ -130,7 +130,7 @@ def act_on(
 
 
 def told(outcome: Outcome) -> str:
-    """What was done. Raises DoraSystemdError for a problem."""
+    """Return the text of an outcome. Raises DoraSystemdError for a problem."""
     if outcome.problem:
         hint = outcome.hint or f"doractl why {outcome.subject.name}"
         raise DoraSystemdError(outcome.problem, hint, outcome.code)

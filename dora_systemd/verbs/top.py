@@ -74,7 +74,7 @@ def _is_same_run(one: Reading, other: Reading) -> bool:
 
 
 def read_snapshot(manager: Manager, scope: Scope, is_whole: bool = False) -> list[Observed]:
-    """All dataflows that systemd has loaded, including failed ones.
+    """Read all dataflows that systemd has loaded, including failed ones.
 
     is_whole: with all that `list` knows of them, and not only what a reading shows.
     """
@@ -88,7 +88,7 @@ def read_snapshot(manager: Manager, scope: Scope, is_whole: bool = False) -> lis
 
 
 def _observe(reading: Reading, row: DataflowRow) -> Observed:
-    """What a reading shows of a dataflow, with its pressure stall information."""
+    """Return what a reading shows of a dataflow, with its pressure stall information."""
     restarts = reading.unit["NRestarts"]
     return Observed(
         row,

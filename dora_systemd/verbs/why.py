@@ -38,7 +38,7 @@ WORDS_OF_START = 10
 
 
 def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReader) -> Report:
-    """What happened to the dataflow that `selector` means, and why.
+    """Explain what happened to the dataflow of `selector`, and why.
 
     Raises DoraSystemdError: NOT_FOUND, USAGE if several match.
     """
@@ -87,7 +87,7 @@ def _trial_words(
 
 
 def _undone(scope: Scope, subject: Subject) -> Switch | None:
-    """How the last release ended, if nothing newer runs in its place; None if it is not known."""
+    """Read how the last release ended, if no newer one runs instead; None if that is not known."""
     # Imported late: few dataflows have releases.
     from dora_systemd.verbs.releases.listing import store_of
 

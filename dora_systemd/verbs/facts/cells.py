@@ -114,7 +114,7 @@ class Cell:
 
 
 def read_cells(manager: Manager) -> list[Cell]:
-    """All dataflows that systemd has loaded, by name, without foreign units of such names.
+    """Read all dataflows that systemd has loaded, by name, without foreign units of such names.
 
     One question, if all have the Description= of this version.
     """

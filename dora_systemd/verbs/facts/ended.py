@@ -45,7 +45,7 @@ def not_recorded(error: DoraSystemdError) -> DoraSystemdError:
 def newest_ended(
     manager: Manager, scope: Scope, rows: Sequence[DataflowRow], limit: int | None
 ) -> list[DataflowRow]:
-    """What has ended: for each name without a running dataflow the newest one, newest first.
+    """Return the newest ended dataflow of each name that does not run, newest first.
 
     rows: all that systemd has loaded. limit: the maximum number of them, None: _MOST_NAMES.
     """

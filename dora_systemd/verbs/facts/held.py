@@ -37,7 +37,7 @@ class Held(NamedTuple):
 
 
 def read_held(manager: Manager, cell: Cell) -> Held:
-    """What systemd waits for before it starts the dataflow. Raises DoraSystemdError."""
+    """Read what systemd waits for before it starts the dataflow. Raises DoraSystemdError."""
     needs = format_awaited(manager.awaited(cell.unit))
     facts = manager.read(cell.unit, _FACTS)
     asked = written_us(Path(facts["FragmentPath"])) if facts["Transient"] else 0

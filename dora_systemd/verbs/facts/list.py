@@ -87,7 +87,7 @@ def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
 
 
 def read_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
-    """All dataflows that systemd has loaded."""
+    """Read the rows of all dataflows that systemd has loaded."""
     cells = proven(read_cells(manager))
     rows = [dataflow_row(manager, scope, cell) for cell in cells]
     return mark_enabled(manager, scope, rows) if rows else []

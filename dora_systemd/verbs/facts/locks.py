@@ -52,7 +52,7 @@ def mark_inhibited(scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRo
 
 
 def read_cell_flocks(scope: Scope) -> Flocks:
-    """All locks on the file system that has the directories of dataflows, by inode."""
+    """Read all locks on the file system with the directories of dataflows, by inode."""
     try:
         device = (scope.runtime_root / RUNTIME_NAME).stat().st_dev
     except OSError:
@@ -61,7 +61,7 @@ def read_cell_flocks(scope: Scope) -> Flocks:
 
 
 def holders_of(scope: Scope, name: str, flocks: Flocks) -> tuple[Holder, ...]:
-    """Who holds locks of a dataflow. Raises DoraSystemdError for a lock file that is not usable."""
+    """Read who holds locks of a dataflow. Raises DoraSystemdError for an unusable lock file."""
     lock = open_lock(scope.cell_directory(name))
     if lock is None:
         return ()
@@ -83,7 +83,7 @@ def _holder(process: LockProcess, name: str, reasons: Mapping[int, str]) -> Hold
 
 
 class IfInhibited(Enum):
-    """What to do with a dataflow whose restart is inhibited."""
+    """The choice for a dataflow whose restart is inhibited."""
 
     REFUSE = "refuse"
     WAIT = "wait"

@@ -19,7 +19,7 @@ _CLD_EXITED = 1
 
 
 def job_reason(manager: Manager, unit: str, result: str) -> str:
-    """Why a start job of `unit` failed; `result`: that of JobRemoved."""
+    """Return why a start job of `unit` failed; `result`: that of JobRemoved."""
     if result == "canceled":
         return "it was stopped while it started"
     if result == "dependency":
@@ -28,7 +28,7 @@ def job_reason(manager: Manager, unit: str, result: str) -> str:
 
 
 def logs_hint(flag: str, name: str, reason: str) -> str:
-    """Where more is found about a dataflow that failed to start, in the words that dora uses.
+    """Return the hint for a dataflow that failed to start, depending on the reason.
 
     flag: of the scope. reason: of job_reason().
     """
@@ -65,7 +65,7 @@ def exit_status(manager: Manager, unit: str) -> int | None:
 
 
 def failure_reason(manager: Manager, unit: str) -> str:
-    """One line about the end of `unit`: the runner's last STATUS=, else systemd's result."""
+    """Format the end of `unit` in one line: the runner's last STATUS=, else systemd's result."""
     facts = manager.read(unit, _PROPERTIES)
     special = result_words(facts["Result"])
     last_words = without_hint(str(facts["StatusText"])).removeprefix(FAILED_BECAUSE)

@@ -21,7 +21,7 @@ _MOST_FITTING = 100
 
 
 def find_soon(find: Callable[[], LogQuery], scope: Scope, selectors: Sequence[str]) -> LogQuery:
-    """What `find` gives, as find_query(). A dataflow that runs may just not be recorded yet."""
+    """Call `find` again for a moment: a running dataflow may not be recorded yet."""
 
     def read() -> LogQuery | DoraSystemdError:
         try:
@@ -144,7 +144,7 @@ def _no_node(pattern: str, names: Sequence[str], known: Sequence[str]) -> DoraSy
 
 
 def _runs_before(run: str) -> int | None:
-    """How many runs before the last one this means, as in `journalctl --boot`; None for an id."""
+    """Parse an offset of runs before the last, as in `journalctl --boot`; None for an id."""
     return -int(run) if _OFFSET.fullmatch(run) else _WORDS.get(run)
 
 

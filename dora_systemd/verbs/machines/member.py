@@ -266,7 +266,7 @@ def _is_down(manager: Manager, unit: str) -> bool:
 
 
 def _failure(manager: Manager, unit: str) -> DoraSystemdError:
-    """Why the runner has ended."""
+    """Return the error with the reason why the runner has ended."""
     refusal = runners_refusal(manager, unit)
     return refusal or DoraSystemdError(f"cannot start {unit}: {failure_reason(manager, unit)}")
 

@@ -97,12 +97,12 @@ def _probe(host: Host, arguments: Sequence[str], mark: str) -> Probe:
 
 
 def _skew(now: int, begun: int, ended: int) -> int:
-    """How far its clock is ahead, at least: it was read between these two of ours."""
+    """Return how far the other clock is ahead, at least: it was read between these two of ours."""
     return min(now - begun, 0) + max(now - ended, 0)
 
 
 def _require(host: Host, mark: str, output: bytes, errors: bytes, status: int) -> str:
-    """What came after the mark. Raises DoraSystemdError (NO_HOST) if there is none."""
+    """Return the output after the mark. Raises DoraSystemdError (NO_HOST) without the mark."""
     said, complained = AfterMark(mark), AfterMark(mark)
     answer, complaint = said.feed(output), complained.feed(errors)
     words = (said.noise, complaint if said.is_open else complained.noise)

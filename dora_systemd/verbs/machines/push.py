@@ -74,7 +74,7 @@ def _copy(member: Member, dataflow: str) -> None:
 
 
 def place_problem(directory: Path, way_out: str) -> tuple[str, str] | None:
-    """Why this account cannot copy from or to a directory of this machine, and a hint.
+    """Return why this account cannot copy from or to a directory of this machine, and a hint.
 
     way_out: for root, if the directory is not root's.
     """

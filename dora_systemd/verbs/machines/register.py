@@ -49,7 +49,7 @@ class Known:
 
 
 def known_machines(scope: Scope, environment: Mapping[str, str]) -> list[Known]:
-    """All of them. Raises DoraSystemdError."""
+    """Read all machines of the settings files. Raises DoraSystemdError."""
     settings = read_config(scope, environment)
     source = settings.source(MACHINES)
     found = (

@@ -310,7 +310,7 @@ def _checked(project: Project, named: Sequence[str], tree: Path, is_user: bool) 
 
 
 def _walk(project: Project) -> tuple[dict[str, Found], set[str]]:
-    """All files, and the directories that are virtual environments."""
+    """Find all files, and the directories that are virtual environments."""
     found: dict[str, Found] = {}
     venvs: set[str] = set()
     queue = [("", "")]

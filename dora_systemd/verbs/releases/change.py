@@ -64,7 +64,7 @@ class Change:
 
 
 class Trial(Protocol):
-    """What judges a release: a Gate."""
+    """The judge of a release: a Gate."""
 
     def run(self, start_limit: int, soak: int) -> Fault | None:
         """Start it and watch it for `soak` µs; None if all is well. Raises DoraSystemdError."""

@@ -93,7 +93,7 @@ class Deployed(NamedTuple):
 def compare(
     manager: Manager, scope: Scope, request: StartRequest, want_build: bool = True
 ) -> tuple[str, dict[str, list[str]]]:
-    """What a deploy would change: the present release, and paths, but none that a build makes.
+    """Find what a deploy would change: the present release, and paths, but none that a build makes.
 
     Raises DoraSystemdError.
     """

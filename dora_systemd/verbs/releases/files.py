@@ -32,7 +32,7 @@ Count = Callable[[int], None]
 
 
 class Target(Protocol):
-    """Where files are copied to. All methods raise OSError."""
+    """The destination of copied files. All methods raise OSError."""
 
     def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
         """Write a file."""
@@ -122,7 +122,7 @@ def _existing(project: Project, paths: Sequence[str]) -> Iterator[Found]:
 
 
 def _walk(project: Project, top: str) -> dict[str, Found]:
-    """All files below a directory that no rule leaves out."""
+    """Find all files below a directory that no rule leaves out."""
     found: dict[str, Found] = {}
     queue = [top]
     for directory in queue:
@@ -140,7 +140,7 @@ def _walk(project: Project, top: str) -> dict[str, Found]:
 
 
 def digests(project: Project, found: Mapping[str, Found]) -> dict[str, Stored]:
-    """What a release of these files would contain, without copying them."""
+    """Return what a release of these files would contain, without copying them."""
     return {
         path: Stored(target=one.target)
         if one.kind == LINK

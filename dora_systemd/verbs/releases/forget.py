@@ -22,7 +22,7 @@ _COMMAND = "doractl forget"
 
 
 class Kept(NamedTuple):
-    """What is kept of a dataflow. uuid: "" if that is not known. releases: their ids."""
+    """The files that are kept of a dataflow. uuid: "" if unknown. releases: their ids."""
 
     name: str
     uuid: str

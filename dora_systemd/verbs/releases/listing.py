@@ -54,7 +54,7 @@ def deployed_names(scope: Scope) -> list[str]:
 
 
 def read_releases(manager: Manager, scope: Scope, names: Sequence[str]) -> list[ReleaseRow]:
-    """All releases of these dataflows, the newest of each one first.
+    """Read all releases of these dataflows, the newest of each first.
 
     Of several dataflows, one whose unit is not ours has releases in an unknown state. Raises
     DoraSystemdError (NAME_IN_USE) for a single one.
@@ -76,7 +76,7 @@ def read_releases(manager: Manager, scope: Scope, names: Sequence[str]) -> list[
 
 
 def read_history(manager: Manager, scope: Scope, name: str) -> list[Switch]:
-    """What ran of a dataflow, newest first. Raises DoraSystemdError."""
+    """Read the changes of a dataflow's release, newest first. Raises DoraSystemdError."""
     current = read_standing(manager, scope, unit_name(name)).current
     return read_past(store_of(scope, name), current)[::-1]
 

@@ -61,7 +61,7 @@ def _known(store: Store) -> Known:
 def compare_sent(
     manager: Manager, scope: Scope, stream: Stream
 ) -> tuple[str, dict[str, list[str]]]:
-    """What a deploy would change, as compare(). Raises DoraSystemdError."""
+    """Find what a deploy of a sent project would change, as compare(). Raises DoraSystemdError."""
     parcel = parse_parcel(stream.line(MOST_HEAD))
     last = present(manager, scope, store_of(scope, parcel.name))
     return last.id if last else "", touched(of_project(last.files) if last else {}, parcel.files)

@@ -162,7 +162,7 @@ def _venv_note(sender: Sender) -> str:
 
 
 def _reader(sender: Sender) -> Account | None:
-    """Who reads the project, None for the caller: never root what others can change."""
+    """Return who reads the project, None for the caller: never root what others can change."""
     try:
         pwd.getpwnam(DEFAULT_USER)
     except KeyError:

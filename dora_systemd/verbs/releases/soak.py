@@ -182,7 +182,7 @@ class Gate:
         return max(late, key=lambda one: one.first, default=None)
 
     def _end(self, state: str) -> Fault | None:
-        """What its end means: a dataflow may finish, everything else is a fault."""
+        """Judge the end of the unit: a dataflow may finish, everything else is a fault."""
         found = self._happenings()
         if fault := find_fault(found, self._before, self._may_wait):
             # The runner's own words have the number of restarts, and may name other nodes, too.
@@ -200,7 +200,7 @@ class Gate:
         return find_fault(self._happenings(), self._before, self._may_wait)
 
     def _happenings(self) -> list[Happening]:
-        """What the journal has of the trial, newest first."""
+        """Read the records of the trial, newest first."""
         matches = [*scope_matches(self._scope, self._options.name)]
         matches += [f"MESSAGE_ID={one}" for one in FAULT_IDS]
         found: list[Happening] = []

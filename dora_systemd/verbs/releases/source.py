@@ -157,7 +157,7 @@ def own_venv(source: Source, tree: Path) -> str | None:
 
 
 def source_notes(source: Source, tree: Path) -> Iterator[str]:
-    """What people have to know about a release of this project in `tree`."""
+    """Yield notes about a release of this project in `tree` (human-readable)."""
     if (venv := source.plan.options.venv) and not own_venv(source, tree):
         yield f"all releases share the virtual environment {shown(venv)}: pip changes all of them"
 
@@ -204,7 +204,7 @@ def _check(plan: Plan, dataflow: Dataflow, root: str, want_build: bool) -> None:
 
 
 def _trouble_of_path(node: Node, directory: str, root: str) -> tuple[str, str]:
-    """Why a node's path leads to a file that a release would not have, and what to do; or ""."""
+    """Return why a node's path leads to a file that a release would not have, and a hint; or ""."""
     place = os.path.normpath(Path(directory, node.working_directory, node.path))
     if ".." not in node.path.split("/") or _is_below(place, root) or not exists(place):
         return "", ""

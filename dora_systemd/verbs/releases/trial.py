@@ -98,7 +98,7 @@ def trial_options(scope: Scope, unit: str) -> RunnerOptions | None:
 
 
 def read_standing(manager: Manager, scope: Scope, unit: str) -> Standing:
-    """What there is of the dataflow. Raises DoraSystemdError (NAME_IN_USE) for foreign units."""
+    """Read the Standing of a dataflow. Raises DoraSystemdError (NAME_IN_USE) for foreign units."""
     options = trial_options(scope, unit)
     boot, path = read_boot_unit(manager, scope, unit), trial_path(scope, unit)
     standing = Standing(boot, path, "", read_cell(manager, unit), path.exists())
@@ -192,7 +192,7 @@ def go_back(
 
 
 def read_life(manager: Manager, unit: str) -> str:
-    """What changes as soon as systemd starts the unit, or is about to."""
+    """Return a text that changes as soon as systemd starts the unit or queues a start."""
     facts = manager.read(unit, ["InvocationID", "Job"])
     return f"{bytes(facts['InvocationID'] or b'').hex()} {queued_job(facts)}"
 
@@ -207,7 +207,7 @@ def _reload(manager: Manager) -> None:
 
 
 def remains(store: Store, standing: Standing) -> Iterator[Path]:
-    """What a deploy or rollback that was killed has left: doctor names it, clean() removes it."""
+    """Find what a killed deploy or rollback has left: doctor names it, clean() removes it."""
     used = {store.release(one) for one in (standing.current, standing.trial) if one}
     yield from (path for path in store.unfinished() if path not in used)
     for place in (standing.boot.path, standing.path):

@@ -156,7 +156,7 @@ def held_notes(manager: Manager, name: str) -> Iterator[str]:
 
 
 def waiting_notes(manager: Manager, options: RunnerOptions) -> Iterator[str]:
-    """What a dataflow that has been started waits for, in the words of the runner."""
+    """Yield what a started dataflow waits for, from its STATUS=."""
     if options.needs:
         text = str(manager.read(unit_name(options.name), ["StatusText"])["StatusText"])
         if WAITS in text:

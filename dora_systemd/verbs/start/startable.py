@@ -33,7 +33,7 @@ from dora_systemd.verbs.start.where import Look, Where
 def check_startable(
     where: Where, sight: Sight, dataflow: Dataflow, is_unbuilt: bool
 ) -> tuple[LaunchPlan, DoraSystemdError | None]:
-    """How the nodes would be launched, and what is missing that a build may still make.
+    """Check how the nodes would be launched, and what is missing that a build may still create.
 
     Raises DoraSystemdError for what the runner would refuse, as far as that needs no dora.
     """

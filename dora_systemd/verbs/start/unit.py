@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], tuple[str, ...]]:
-    """All properties of the unit that this systemd supports, by slot, and warnings.
+    """Return all properties of the unit that this systemd supports, by slot, and warnings.
 
     The warnings are about unsupported properties, and limits above the machine's size. Raises
     DoraSystemdError.
@@ -68,7 +68,7 @@ def passed_on(plan: Plan, systemd_version: int) -> Iterator[str]:
 
 
 def _newer(plan: Plan, manager: Callable[[], Manager]) -> Newer:
-    """What judges a --property that doractl does not know."""
+    """Return the Newer that judges a --property that doractl does not know."""
     assignments = plan.settings[PROPERTY]
     if not unknown_keys(assignments):
         return NOTHING_NEWER

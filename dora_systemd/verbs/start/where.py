@@ -48,7 +48,7 @@ _UV_HOMES = (".local/bin", ".cargo/bin")
 
 @dataclass(frozen=True)
 class Look:
-    """What the user of the nodes sees of their programs."""
+    """The programs of the nodes, as their user sees them."""
 
     sight: Sight
     settings: Settings
