@@ -34,7 +34,7 @@ _MICROSECOND_NS = 1000
 
 @dataclass(frozen=True)
 class Foreground:
-    """What to print of a dataflow, and what stops it."""
+    """The output of an attached dataflow, and what stops the dataflow."""
 
     shown: LogFilter = field(default_factory=LogFilter)
     form: str = FORMATS[0]

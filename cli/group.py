@@ -54,7 +54,7 @@ def _put_examples_last(command: click.Command) -> None:
 
 
 def find_verbs() -> dict[str, Verb]:
-    """All verbs by name. A new file is a new verb."""
+    """Find all verbs by name. A new file is a new verb."""
     root = Path(__file__).with_name("verbs")
     return {
         path.stem: Verb(path.stem, section, path)

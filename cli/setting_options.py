@@ -88,7 +88,7 @@ class SettingsCommand(click.Command):
 
 
 def setting_options(function: F) -> F:
-    """All flags of settings. Their raw values become keyword arguments with the setting's name."""
+    """Add all flags of settings, whose raw values become arguments with the setting's name."""
     return options_of(SETTINGS, function)
 
 

@@ -33,7 +33,7 @@ class Scope(NamedTuple):
 
     @property
     def transient_units(self) -> Path:
-        """Where the manager has its transient units, see systemd.unit(5)."""
+        """The directory of the manager's transient units, see systemd.unit(5)."""
         return self.runtime_root / "systemd/transient"
 
     @property

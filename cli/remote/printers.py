@@ -135,7 +135,7 @@ class JsonPrinter(Whole):
 
 
 class Complaints:
-    """What hosts write to standard error, and errors of hosts. is_json: as objects."""
+    """Prints the standard error of hosts, and errors of hosts. is_json: as objects."""
 
     def __init__(self, is_json: bool) -> None:
         self._is_json = is_json

@@ -104,7 +104,7 @@ class _Answer:
 
     @property
     def errors(self) -> bytes:
-        """What it complains of, but for what -q leaves out."""
+        """The errors of the host, without what -q leaves out."""
         lines = self.complaint.splitlines(keepends=True)
         values = ((line, read_object(line.decode(errors="replace"))) for line in lines)
         return b"".join(line for line, value in values if value is None or "error" in value)

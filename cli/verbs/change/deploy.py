@@ -134,7 +134,7 @@ def _answer(line: str) -> None:
 
 
 def deployed_outcome(done: Deployed, how: str) -> Outcome:
-    """What is printed for a release that runs. how: "deployed" or "rolled back"."""
+    """Return the outcome for a release that runs. how: "deployed" or "rolled back"."""
     details = {"release": done.release or None, "former": done.former or None, "files": done.files}
     details |= {"size_bytes": done.size, "copied_bytes": done.copied}
     if done.is_unchanged:

@@ -79,7 +79,7 @@ def command(
 
 
 def _running(cells: Sequence[Cell], want_all: bool) -> list[Cell]:
-    """All dataflows that run, or the one that the user chooses."""
+    """Return all dataflows that run, or the one that the user chooses."""
     up = [cell for cell in cells if cell.is_up]
     if not up:
         tell("No dataflow is running.")
