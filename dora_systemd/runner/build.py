@@ -93,7 +93,7 @@ class ToJournal:
             self._told = time.monotonic()
 
     def close(self) -> None:
-        """Wait until journald has read all of it: it finds the unit by this process."""
+        """Wait until journald has read all lines: it finds their unit by this process."""
         self._journal.wait_read(_JOURNAL_SECONDS)
         self._journal.close()
 
@@ -133,12 +133,12 @@ class Output:
         self.last = ""
 
     def begin(self, command: Sequence[str]) -> None:
-        """Forget the last command's output. What dora itself prints is not its nodes' output."""
+        """Discard the last command's output."""
         self.tail = self.last = ""
         self._is_dora = not _is_uv(command)
 
     def feed(self, data: bytes) -> None:
-        """Take what a command has printed; b"" for its end."""
+        """Handle output of a command; b"" for its end."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if not data or len(self._rest) > _LONGEST:
             lines, self._rest = [*lines, self._rest], b""
@@ -146,7 +146,7 @@ class Output:
             self._take(line)
 
     def close(self) -> None:
-        """Wait until all of it is read. Raises OSError."""
+        """Wait until all output is read. Raises OSError."""
         self._sink.close()
 
     def _take(self, line: bytes) -> None:
@@ -160,7 +160,7 @@ class Output:
 
 
 def run_command(command: Sequence[str], directory: str, output: Output) -> int:
-    """Run a command to its end: its exit status. Raises Gone, OSError and DoraSystemdError."""
+    """Run a command; return its exit status. Raises Gone, OSError and DoraSystemdError."""
     output.begin(command)
     environment = {**nodes_environment(directory), "RUST_BACKTRACE": "0", "NO_COLOR": "1"}
     child = spawn(command, own_account(), environment, directory, stderr=subprocess.STDOUT)
@@ -179,7 +179,7 @@ def run_command(command: Sequence[str], directory: str, output: Output) -> int:
 
 
 def _follow(pipe: int, end: int, output: Output) -> None:
-    """Take what a child prints until it ends. end: its pidfd. Raises Gone."""
+    """Handle the output of a child until it ends. end: its pidfd. Raises Gone."""
     stdin = sys.stdin.fileno()
     watched = [stdin, end, pipe]
     # A process that it leaves may hold the pipe for ever: what counts is the end of the command.
@@ -204,7 +204,7 @@ def _end(leader: int, end: int) -> None:
 
 
 def _read(pipe: int, output: Output) -> bool:
-    """Take what is in the pipe; whether there can be more."""
+    """Handle what is in the pipe; return whether there can be more."""
     data = os.read(pipe, _CHUNK)
     if data:
         output.feed(data)

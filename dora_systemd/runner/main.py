@@ -197,7 +197,7 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
 
 
 def begin_again(runs: Runs, last: Cell) -> None:
-    """Another run begins in this process. After the loss of a machine it reads the files again."""
+    """Prepare another run in this process, with files read again after the loss of a machine."""
     if runs.this_life.up_us:
         notify.send_reloading()
     runs.role.begin_again(last)

@@ -54,7 +54,7 @@ class Watch:
         self._event.clear()
 
     def wake(self) -> None:
-        """Let the task look again."""
+        """Make the task check again."""
         self._event.set()
 
     async def wait(self, seconds: float) -> None:
@@ -121,7 +121,7 @@ class Needs:
         return down - self._closed
 
     async def work(self) -> None:
-        """Look, and act, again and again, until the run ends."""
+        """Check the needs, and act, until the run ends."""
         with contextlib.closing(self._watch):
             while await self._run.pump.wait(lambda cell: cell.state in _STATES, None):
                 self._watch.clear()
@@ -205,7 +205,7 @@ class Needs:
             self._watch.wake()
 
     def _renew_start(self) -> None:
-        """The time of waiting is not part of the start timeout: it begins again."""
+        """Begin the start timeout again, which excludes the time of waiting."""
         if self._run.pump.cell.state is not State.WAITING or self._start_timeout == INFINITY:
             return
         notify.extend_timeout(2 * self._start_timeout)

@@ -38,7 +38,7 @@ def let_openssl_in() -> None:
 
 
 def enter_supervisor() -> Path:
-    """The cgroup directory of the unit, with this process in its group `supervisor`.
+    """Move this process into the group `supervisor`; return the cgroup directory of the unit.
 
     DelegateSubgroup= does this, but systemd before 254 does not have it. Raises OSError.
     """
@@ -51,7 +51,7 @@ def enter_supervisor() -> Path:
 
 
 def nodes_environment(directory: str) -> dict[str, str]:
-    """The environment of nodes that run in `directory`."""
+    """Return the environment of nodes that run in `directory`."""
     home = ""
     if "HOME" not in os.environ:
         with contextlib.suppress(KeyError):
@@ -92,7 +92,7 @@ def start_coordinator(
 def daemon_variables(
     options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
 ) -> dict[str, str]:
-    """Variables of the daemon that nodes do not get; launcher.pl removes them.
+    """Return variables of the daemon that nodes do not get; launcher.pl removes them.
 
     unit: cgroup directory. environment: of the nodes.
     """
@@ -151,5 +151,5 @@ def start_daemon(
 
 
 def read_token(paths: CellPaths) -> str:
-    """The token that the listening coordinator has written. Raises OSError."""
+    """Read the token that the listening coordinator has written. Raises OSError."""
     return (paths.coordinator / ".dora-token").read_text().strip()

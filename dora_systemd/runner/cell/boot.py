@@ -50,7 +50,7 @@ class EarlyDaemon:
         return None
 
     def _find_port(self) -> int:
-        """The port of the coordinator; 0 if it does not listen, or not yet."""
+        """Return the port of the coordinator; 0 if it does not listen, or not yet."""
         raise NotImplementedError
 
     def _spawn_daemon(self) -> Daemon:

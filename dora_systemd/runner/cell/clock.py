@@ -65,14 +65,14 @@ class StopClock:
             self._began, self.by = self._now(), by
 
     def left(self, most: float) -> float:
-        """Seconds left for a step that may take at most `most` seconds."""
+        """Return the seconds left for a step that may take at most `most` seconds."""
         timeout = runner_timeout(self._grace)
         if self.by and timeout != INFINITY:
             most = min(most, self._began + timeout / SECOND - self._now())
         return max(most, 0.0)
 
     def for_journal(self) -> Callable[[], float]:
-        """A function for the seconds that journald may still take; a stop request shortens them."""
+        """Return a function for the seconds left for journald; a stop request shortens them."""
         begin = self._now()
 
         def left() -> float:

@@ -249,7 +249,7 @@ class Dialogue(Tasks):
             self._pump.push(life.ChildExited(now_us(), "daemon", Exit(words="earlier")))
 
     async def watch_dora(self, seconds: float) -> None:
-        """See every `seconds` that neither coordinator nor daemon hangs.
+        """Check every `seconds` that neither coordinator nor daemon hangs.
 
         While the cell stops, TimeoutStopSec= bounds it. After a time in which the cell did not run,
         dora's processes have to find each other again.
@@ -266,7 +266,7 @@ class Dialogue(Tasks):
                     self._pump.push(life.ConnectionLost(now_us(), silent, reason))
 
     async def take_samples(self, seconds: float) -> None:
-        """Every `seconds`: sample the CPU time used so far."""
+        """Sample the used CPU time every `seconds`."""
         while True:
             self._pump.sample()
             await asyncio.sleep(seconds)

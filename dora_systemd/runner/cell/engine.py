@@ -106,7 +106,7 @@ class Engine:
         return bool(protocol.result_of(reply, "DaemonConnected"))
 
     async def find_silent(self, seconds: float) -> str:
-        """The process that hangs, "coordinator" or "daemon", or "" if both respond.
+        """Find the process that hangs, "coordinator" or "daemon", or "" if both respond.
 
         seconds: timeout for the coordinator's answer. The request does not involve the daemon: dora
         would then keep the coordinator from answering anything else for 30 s.
@@ -134,7 +134,7 @@ class Engine:
         return await control.Connection.open(self._port, self._token)
 
     async def start_run(self, descriptor: Mapping[str, Any], name: str) -> str:
-        """Send the descriptor; dora's id of the run. Raises DoraSystemdError."""
+        """Send the descriptor; return dora's id of the run. Raises DoraSystemdError."""
         params = protocol.start_params(descriptor, name, str(self._paths.work))
         reply = await self.ask(params)
         return str(protocol.result_of(reply, "DataflowStartTriggered")["uuid"])

@@ -15,7 +15,7 @@ Push = Callable[[life.Event], None]
 
 
 def failed(what: str, error: Exception) -> life.Failed:
-    """The event for an exception. Prints the traceback to the journal, at debug level."""
+    """Return the event for an exception. Prints the traceback to the journal, at debug level."""
     at_us = time.time_ns() // 1000
     if isinstance(error, DoraSystemdError):
         return life.Failed(at_us, what, error.message)
@@ -31,7 +31,7 @@ def say(text: str) -> None:
 
 
 def words(error: Exception) -> str:
-    """The exception in one line."""
+    """Format the exception in one line."""
     return " ".join(f"{type(error).__name__}: {error}".removesuffix(": ").split())
 
 
@@ -76,7 +76,7 @@ class Beside(Tasks):
         loop.set_exception_handler(self._callback_raised)
 
     def attach(self, push: Push) -> None:
-        """A run begins: send events to its `push`."""
+        """Send events to the `push` of the run that begins."""
         self._push = push
         if self._failure is not None:
             push(self._failure)

@@ -70,15 +70,15 @@ class Alone:
         return None
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
-        """The dataflow has been read, and its run begins. Raises DoraSystemdError."""
+        """Prepare the run of the dataflow, which has been read. Raises DoraSystemdError."""
 
     def begin_again(self, last: Cell) -> None:
-        """Another run begins in this process. last: the cell of the one before, at its end."""
+        """Prepare another run in this process. last: the last cell of the run before."""
 
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
-        """The dora of this machine."""
+        """Return the Engine of this machine."""
         return Engine(dora, paths, environment, boot)
 
     def start_coordinator(self, dora: Engine) -> Child | None:
@@ -93,7 +93,7 @@ class Alone:
         """Notify the node's machine of a requested restart or stop, before that is carried out."""
 
     def cell(self, cell: Cell) -> Cell:
-        """The cell at the beginning of a run."""
+        """Return the cell at the beginning of a run."""
         return cell
 
     def dialogue(

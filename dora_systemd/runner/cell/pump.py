@@ -39,7 +39,7 @@ from dora_systemd.values import SECOND
 
 
 def now_us() -> int:
-    """CLOCK_REALTIME in µs."""
+    """Read CLOCK_REALTIME in µs."""
     return time.time_ns() // 1000
 
 

@@ -52,7 +52,7 @@ def pause(options: RunnerOptions, paths: CellPaths) -> None:
 
 
 def find_spent(options: RunnerOptions, paths: CellPaths) -> RestartsSpent | None:
-    """The error of a restart that exceeds the budget of automatic restarts, None for others."""
+    """Return the error of a restart that exceeds the budget of restarts, or None."""
     policy, lives = options.restart, fd_store.lives()
     if policy.policy == "no" or lives <= policy.max_restarts:
         return None
@@ -90,13 +90,13 @@ def hold_back(options: RunnerOptions, paths: CellPaths, old: float | None = None
 
 
 def age() -> float:
-    """Seconds since systemd began this process, which was before it set up the sandbox."""
+    """Return seconds since systemd began this process, which was before it set up the sandbox."""
     start = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
     return time.clock_gettime(time.CLOCK_BOOTTIME) - int(start) / os.sysconf("SC_CLK_TCK")
 
 
 def asked(what: str, name: str, is_user: bool, otherwise: int) -> int:
-    """A number that systemd has of the unit.
+    """Read a number that systemd has of the unit.
 
     A reset or a restart of the unit sets NRestarts to 0.
     """
@@ -163,7 +163,7 @@ def is_transient(name: str, is_user: bool) -> bool:
 
 
 def _transient(name: str, is_user: bool) -> Path:
-    """The file of a transient unit, see UnitPath in systemd.unit(5)."""
+    """Return the path of a transient unit's file, see UnitPath in systemd.unit(5)."""
     root = os.environ.get("XDG_RUNTIME_DIR", "") if is_user else "/run"
     return Path(root, "systemd/transient", unit_name(name))
 
@@ -178,12 +178,12 @@ class Life:
         self.up_us = 0  # CLOCK_MONOTONIC, as ActiveEnterTimestampMonotonic=; 0 before that
 
     def become_up(self) -> None:
-        """The nodes are ready. A run after a reload changes nothing: the unit has been up."""
+        """Record when the nodes became ready; a run after a reload changes nothing."""
         self.up_us = self.up_us or time.monotonic_ns() // 1000
 
 
 def begin_life(options: RunnerOptions, is_user: bool) -> Life:
-    """The life that begins with this process."""
+    """Return the life that begins with this process."""
     is_first = is_first_life(options.restart, options.name, is_user)
     return Life(options.uuid, is_first, not is_first and fd_store.is_first_life())
 

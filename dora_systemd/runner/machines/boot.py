@@ -53,7 +53,7 @@ _OVERLAYS = ("ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY")
 def choose_ports(
     members: Sequence[str], addresses: Sequence[str] = (), ports: Sequence[int] = PORT_RANGE
 ) -> Forwards:
-    """Ports that are free here, other ones each time. Raises DoraSystemdError if there are none.
+    """Choose free ports, other ones each time. Raises DoraSystemdError if there are none.
 
     addresses: of the options; the daemon here listens on the first one.
     """
@@ -73,7 +73,7 @@ def choose_ports(
 
 
 def shared_environment(environment: Mapping[str, str], addresses: Sequence[str]) -> dict[str, str]:
-    """The environment of dora's processes."""
+    """Return the environment of dora's processes."""
     return {**environment, **({} if addresses else _NO_DIRECT)}
 
 

@@ -136,7 +136,7 @@ class Head(Shared):
         return SharedEngine(dora, paths, own, boot, ports.coordinator, more, self.roster.set_token)
 
     def cell(self, cell: Cell) -> Cell:
-        """The cell, with the machine of each node."""
+        """Return the cell, with the machine of each node."""
         placed = self.options.placed
         nodes = {
             ident: node._replace(machine=placed_on(placed, ident))
@@ -167,7 +167,7 @@ class Head(Shared):
     def dialogue(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> Dialogue:
-        """Dialogue of a head: waits for all members, and ends nodes without dora if one is lost."""
+        """Return the Dialogue of a head, which waits for all members, and handles their loss."""
         assert isinstance(dora, SharedEngine)
         pipes.left_out = NOISE
         self.roster.push, self.roster.refresh = pump.push, pump.refresh
@@ -276,7 +276,7 @@ class HeadDialogue(Dialogue):
         return format_missing(missing)
 
     async def _extend_start(self) -> None:
-        """Waiting for a machine is no part of TimeoutStartSec=, see sd_notify(3)."""
+        """Extend TimeoutStartSec= by the time of the wait for machines, see sd_notify(3)."""
         while self._pump.cell.state is State.GATHERING:
             notify.extend_timeout(round(3 * _EXTEND_SECONDS * SECOND))
             await asyncio.sleep(_EXTEND_SECONDS)
@@ -365,7 +365,7 @@ class HeadDialogue(Dialogue):
         await super()._ask_stop()
 
     def _lose_silent(self) -> bool:
-        """Do without dora if a machine falls silent that still has nodes."""
+        """End the nodes without dora if a machine with nodes falls silent."""
         nodes = self._pump.cell.nodes
         needed = {nodes[node].machine for node in with_process(nodes)}
         if silent := next((name for name in self._roster.silent() if name in needed), ""):
@@ -377,7 +377,7 @@ class HeadDialogue(Dialogue):
             await asyncio.sleep(_LOOK_SECONDS)
 
     def _begin_end(self) -> float:
-        """Seconds left of the grace duration, which begins with the first call."""
+        """Return the seconds left of the grace duration, which begins with the first call."""
         now = time.monotonic()
         self._ends_at = self._ends_at or now + self._pump.cell.grace / SECOND
         return max(self._ends_at - now, 0.0)

@@ -79,7 +79,7 @@ class Uses:
         self._told: Mapping[str, list[Any]] = {}
 
     def added(self, table: CellStatus) -> CellStatus:
-        """The table of this machine, with what its nodes use."""
+        """Return the table of this machine, with the usage of its nodes."""
         seen = table.samples, table.stage
         if seen != self._seen:
             self._seen, self._told = seen, self._read(table)
@@ -97,7 +97,7 @@ class Uses:
 
 
 class Member(Shared):
-    """A machine that another one has given nodes. take_over: gives the connection to the head."""
+    """The role of a member. take_over: returns the connection to the head."""
 
     def __init__(
         self,
@@ -126,7 +126,7 @@ class Member(Shared):
         self.is_going_down: Callable[[bool], bool] = is_going_down
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
-        """Write how each node is started. Raises DoraSystemdError."""
+        """Write the file launch/NODE of each node. Raises DoraSystemdError."""
         self._version, self._prepared = check.version(), prepared
         check_placed(self.options, prepared.dataflow)
         paths.launch.mkdir(mode=0o700, exist_ok=True)
@@ -136,17 +136,17 @@ class Member(Shared):
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
-        """A daemon for the coordinator of the head."""
+        """Return the Engine with a daemon for the coordinator of the head."""
         self._environment = environment
         own = shared_environment(environment, self.options.addresses)
         self._dora = MemberEngine(dora, paths, own, boot)
         return self._dora
 
     def start_coordinator(self, dora: Engine) -> None:
-        """The only one is the head's."""
+        """Start nothing: only the head has a coordinator."""
 
     def cell(self, cell: Cell) -> Cell:
-        """The cell of a member."""
+        """Return the cell of a member."""
         return replace(cell, machine=self.options.machine)
 
     def dialogue(

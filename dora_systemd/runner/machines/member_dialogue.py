@@ -1,4 +1,4 @@
-"""Carries out what a member does: it finds the run of the head, and judges its own nodes only."""
+"""Carries out the actions of a member: finds the run of the head, and handles its own nodes."""
 
 import asyncio
 import contextlib
@@ -141,7 +141,7 @@ class MemberDialogue(Dialogue):
         self._ask(Do.END_NODES, self._end_nodes())
 
     def _child_exited(self, label: str, exit: Exit) -> None:
-        """Without a head the nodes have their grace duration, and no daemon."""
+        """Ignore the exit of the daemon while the nodes end without a head."""
         if not (self._is_cut_off and self._pump.cell.state is State.STOPPING):
             super()._child_exited(label, exit)
 

@@ -128,7 +128,7 @@ class Roster:
             self._send_part(name)
 
     def works(self) -> Mapping[str, str]:
-        """dora's directory on each machine."""
+        """Return dora's directory on each machine."""
         return {name: one.work for name, one in self._members.items()}
 
     def endpoints(self) -> Endpoints:
@@ -137,11 +137,11 @@ class Roster:
         return {name: (one, self._ports.zenoh[name]) for name, one in addresses.items()}
 
     def missing(self) -> dict[str, str]:
-        """The members that are not ready, and why."""
+        """Return the members that are not ready, and why."""
         return {name: one.words for name, one in self._members.items() if not one.work}
 
     def silent(self) -> list[str]:
-        """The members that may be gone."""
+        """Return the members that may be gone."""
         return [name for name, one in self._members.items() if not one.is_heard]
 
     def tell(self, message: wire.Message) -> None:
@@ -177,7 +177,7 @@ class Roster:
         return merged(table, {name: one.table for name, one in self._members.items()})
 
     async def link(self, request: Request, ends: Ends) -> None:
-        """The session of a link."""
+        """Serve the session of a link."""
         name = str(request.get("machine"))
         if name not in self._members:
             message = f"machine {quoted(name)} has no node of this dataflow"

@@ -113,7 +113,7 @@ _MOST_BYTES = 32 << 20
 def own_digests(
     options: RunnerOptions, prepared: Prepared, environment: Mapping[str, str]
 ) -> dict[str, str]:
-    """The digests of the programs of this machine's nodes. Raises DoraSystemdError."""
+    """Compute the digests of the programs of this machine's nodes. Raises DoraSystemdError."""
     by_node = Sources(options, environment).files(prepared)
     files = {one for node, some in by_node.items() if is_here(options, node) for one in some}
     root = Path(options.dataflow).parent
@@ -121,7 +121,7 @@ def own_digests(
 
 
 def read_digests(root: Path, paths: Iterable[str]) -> dict[str, str]:
-    """The digests of the regular files among `paths`, which are relative to `root`."""
+    """Compute the digests of the regular files among `paths`, which are relative to `root`."""
     found = {path: _digest(root / path) for path in list(paths)[:MOST_FILES] if path[:2] != ".."}
     return {path: one for path, one in found.items() if one}
 

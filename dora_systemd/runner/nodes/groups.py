@@ -40,7 +40,7 @@ class Resources:
         return None if owner is None else self._oom(owner, group)
 
     def _same(self, owner: Owner | None) -> Owner | None:
-        """The owner. The first process takes the counter of the unit, also for further ones."""
+        """Return the owner of the limit, for further kills of one shortage that of the first."""
         if owner is Owner.DATAFLOW:
             self._short_until = self._clock() + _ONE_SHORTAGE
         is_same = owner is Owner.MACHINE and self._clock() < self._short_until
@@ -59,7 +59,7 @@ class Resources:
         return Oom(owner, peak, limit, *largest(held))
 
     def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> list[Record]:
-        """Events about limits that are close. samples: those before `now`."""
+        """Return events about limits that are close. samples: those before `now`."""
         nodes = cgroup.node_groups(self._unit)
         nodes.pop(PROBE, None)  # it is no node of the dataflow
         groups = {WHOLE_CELL: self._unit, **nodes}

@@ -81,14 +81,14 @@ class Gates:
         self._fill(node, _LEAVE)
 
     def close(self, node: str) -> None:
-        """Let the launchers of the node wait."""
+        """Close the gate, so that the launchers of the node wait."""
         self._passing.discard(node)
         if (fd := self._open.pop(node, None)) is not None:
             self._empty(fd)
             os.close(fd)
 
     def dismiss(self) -> None:
-        """The run is about to end: end the launchers that wait. Nodes past their gate run on."""
+        """End the launchers that wait, because the run is about to end; other nodes run on."""
         self._is_over = True
         for node in self._known - self._passing:
             with contextlib.suppress(OSError):  # the whole directory may be gone

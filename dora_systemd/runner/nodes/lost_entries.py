@@ -76,7 +76,7 @@ class LossWatch:
         self._is_open = lost > self._lost
 
     async def finish(self) -> None:
-        """The last check, after everything has been sent: without a tolerance."""
+        """Check without a tolerance, after everything has been sent."""
         if self._sent() - self._base < WORTH:
             return
         await asyncio.sleep(_SETTLE_SECONDS)
@@ -85,7 +85,7 @@ class LossWatch:
 
 
 def losses_of_user(journal: JournalSocket, pipes: LogPipes) -> LossWatch | None:
-    """A LossWatch for the services of this user, or None if the user cannot read a journal."""
+    """Create a LossWatch for the services of this user; None without a readable journal."""
     from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 
     def report(count: int) -> None:

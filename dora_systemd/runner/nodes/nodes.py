@@ -148,7 +148,7 @@ class Nodes:
         return node in self._holds and self._holds[node].is_held
 
     def expect(self) -> None:
-        """The nodes are about to be started: each launcher moves itself into its group.
+        """Prepare for the launchers, which move themselves into their groups.
 
         The kernel makes the first move in a while wait for some 10 ms. A move that changes nothing
         waits for that now, in a thread.
@@ -176,7 +176,7 @@ class Nodes:
             hold.look(backlog)
 
     def adopt(self, node: str, pid: int, rights: Sequence[NodeRights] = ()) -> None:
-        """Dora has executed `node`: name its lines, and move it unless its launcher has done so.
+        """Name the lines of `node`, which dora has executed, and move it unless its launcher has.
 
         rights: of the nodes that have some.
         """
@@ -206,23 +206,23 @@ class Nodes:
         return node in self._launched
 
     def noted_pid(self, node: str) -> int:
-        """The process that the launcher of the node became, 0 if there is none yet."""
+        """Read the pid that the launcher of the node has written, 0 if there is none yet."""
         with contextlib.suppress(OSError, ValueError):
             return int(self._paths.node_pid(node).read_text())
         return 0
 
     def let_go(self) -> None:
-        """The nodes are about to end: stop freezing them."""
+        """Stop freezing the nodes, because they are about to end."""
         for hold in self._holds.values():
             hold.end()
 
     def exchanging(self, node: str) -> AbstractContextManager[None]:
-        """Do not freeze `node` meanwhile, because dora is going to end it."""
+        """Keep `node` thawed in the context, because dora is going to end it."""
         hold = self._holds.get(node)
         return nullcontext() if hold is None else hold.paused()
 
     def forget(self, node: str) -> None:
-        """The node's process has ended: later lines and signs come from its next process."""
+        """Discard the state of the node's ended process, before its next process starts."""
         self._pipes.set_pid(node, 0)
         if self.notify_sockets:
             self.notify_sockets.forget(node)
@@ -296,7 +296,7 @@ class Nodes:
             await asyncio.sleep(seconds)
 
     def sample(self, now_us: int) -> CpuSample:
-        """CPU time used so far by the cell and by each node."""
+        """Read the CPU time used so far by the cell and by each node."""
         groups = {WHOLE_CELL: self._unit, **cgroup.node_groups(self._unit)}
         use = {key: cgroup.read_cpu(path) for key, path in groups.items()}
         return CpuSample(

@@ -17,7 +17,7 @@ _OF_UNITS = re.compile(r"/(dora-|doractl-check-)[^/]+\.service(/|$)")
 
 
 def launcher_rights(options: RunnerOptions, unit: Path) -> str:
-    """The programs through which launcher.pl executes the nodes, one line for each node.
+    """Return the programs through which launcher.pl executes the nodes, a line for each node.
 
     unit: cgroup directory. Without a cpuset controller the launcher binds nodes to their CPUs.
     """

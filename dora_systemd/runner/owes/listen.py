@@ -17,7 +17,7 @@ class Ignored(type):
     """The class of a class whose functions all do nothing."""
 
     def __getattr__(cls, name: str) -> Callable[..., None]:
-        """A function that ignores its arguments."""
+        """Return a function that ignores its arguments."""
         if name.startswith("__"):
             raise AttributeError(name)
         return lambda *_, **__: None
@@ -54,7 +54,7 @@ def listen(node: Any, times: memoryview, seconds: float) -> None:
 
 
 def main(path: str, seconds: float) -> None:
-    """Open the file, and be a node."""
+    """Open the file, and run as a node."""
     with open(path, "r+b") as file:  # noqa: PTH123 - without pathlib, which is more memory
         times = memoryview(mmap.mmap(file.fileno(), 0)).cast("Q")
     leave_out_arrow()

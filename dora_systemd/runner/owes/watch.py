@@ -65,7 +65,7 @@ class Watch:
         self._ready: dict[str, tuple[int, int]] = {}
 
     async def work(self) -> None:
-        """Look again and again; the probe is started, and again if it has ended."""
+        """Check the outputs periodically, and keep a probe running."""
         loop = asyncio.get_running_loop()
         while True:
             # CLOCK_MONOTONIC stops while the machine is suspended, and cannot be set.
@@ -80,7 +80,7 @@ class Watch:
         return not self._run.pump.cell.nodes.get(node, NodeStatus()).machine
 
     def close(self) -> None:
-        """Forget the file of times."""
+        """Close the file of times."""
         self._times.close()
 
     def _look(self, now: Look) -> None:
@@ -167,5 +167,5 @@ class SharedTimes:
         return self._map[:]
 
     def close(self) -> None:
-        """Forget it; the file stays for those who read it by its path."""
+        """Unmap the file, which stays for readers by its path."""
         self._map.close()

@@ -81,7 +81,7 @@ class Reloader:
         self.notice = ""
 
     def begin(self, run: Run, prepared: Prepared, begun_ns: int) -> None:
-        """A run of the dataflow begins. begun_ns: before its nodes start, CLOCK_REALTIME."""
+        """Watch the files of a run. begun_ns: before its nodes start, CLOCK_REALTIME."""
         self._run, self.current, self._begun_ns = run, prepared, begun_ns
         self._has_imports = False
         if not self.options.placed:  # no reload
@@ -97,7 +97,7 @@ class Reloader:
         return self._run
 
     def end(self) -> None:
-        """The run has ended."""
+        """Forget the run, which has ended."""
         self._run = None
         self._begun.clear()
 
@@ -119,7 +119,7 @@ class Reloader:
                     self._versions.add(node, files, self._begun_ns)
 
     def go_back(self, reason: str) -> bool:
-        """Switch back if a run failed before it had started; whether there is a version before."""
+        """Switch back if a run failed during its start; return whether a former version exists."""
         self._settle(reason)
         if self.before is None:
             return False
@@ -129,7 +129,7 @@ class Reloader:
         return True
 
     def definition(self, node: str) -> Mapping[str, Any]:
-        """A node of the current version, as dora gets it."""
+        """Return the definition of a node of the current version, as dora gets it."""
         nodes = self.current.descriptor["nodes"] if self.current else []
         return next(one for one in nodes if one["id"] == node)
 
@@ -143,7 +143,7 @@ class Reloader:
             self._outcome.set_result(outcome)
 
     async def work(self) -> None:
-        """Reload changed files, again and again."""
+        """Reload changed files until cancelled."""
         try:
             self._settings.keep()
         except DoraSystemdError as error:
@@ -185,7 +185,7 @@ class Reloader:
             self._run.pipes.write_event("reload-failed", reason=error.message + hint)
 
     async def _reload(self, changed: Collection[str], node: str = "") -> list[str]:
-        """Apply the changed files, and reload `node` in any case; what was done."""
+        """Apply the changed files, and reload `node` in any case; return what was done."""
         async with self._lock:
             run, current = self._run, self.current
             if run is None or current is None:
@@ -221,13 +221,13 @@ class Reloader:
         return self._moved() not in (None, self._tried)
 
     def _moved(self) -> RunnerOptions | None:
-        """The options with the present paths of the dataflow, if links lead elsewhere. Blocks."""
+        """Return the options with the present paths, if links have changed. Blocks."""
         now = resolved(self._given)
         is_there = self.options.placed or _place(now) == _place(self.options)
         return None if is_there else _at(self.options, now)
 
     async def _follow_link(self, run: Run, moved: RunnerOptions) -> list[str]:
-        """Run the dataflow that a link leads to now, all of it: its daemon knows directories."""
+        """Run the whole dataflow that a link leads to now, as its daemon knows directories."""
         self._tried, since = moved, Since(time.monotonic_ns())
         taken = Versions()
         taken.take(moved.dataflow, [moved.dataflow])
@@ -328,7 +328,7 @@ class Reloader:
             raise
 
     def _changed_since(self) -> list[str]:
-        """The files that differ from what runs. Blocks. Raises DoraSystemdError."""
+        """Return the files that differ from the running ones. Blocks. Raises DoraSystemdError."""
         current, dataflow = self.current, self.options.dataflow
         if current is None or self._moved() is not None:
             return []
@@ -382,6 +382,6 @@ def _files(change: Change) -> list[str]:
 
 
 def _names(change: Change, changed: Collection[str]) -> list[str]:
-    """The names of the files that matter; of all changed files for a whole reload."""
+    """Return the names of the files that matter; of all changed files for a whole reload."""
     found = _files(change) if change.steps else sorted(changed)
     return [PurePath(path).name for path in found]
