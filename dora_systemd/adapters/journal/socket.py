@@ -212,4 +212,4 @@ class _Channel:
 
 
 def _ignore() -> None:
-    """The callback before there is one."""
+    """Do nothing, until a callback is set."""

@@ -60,7 +60,7 @@ class Spool:
         return False
 
     def link(self, path: str, target: str) -> Stored:
-        """A symbolic link has no content."""
+        """Return the entry of a symbolic link, which has no content."""
         del path
         return Stored(target=target)
 

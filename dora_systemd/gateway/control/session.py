@@ -60,7 +60,7 @@ class Talk:
         self._next.clear()
 
     async def end(self) -> None:
-        """The client has disconnected: end all of its tasks, and close what they would have."""
+        """End all tasks of a disconnected client, and close what they use."""
         self.is_over = True
         for one in self._next:
             one.close()
