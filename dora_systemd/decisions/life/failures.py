@@ -33,7 +33,7 @@ _FINAL = {
 
 
 def refused(cell: Cell, event: life.Refused) -> Next:
-    """dora refuses the dataflow or a request of the runner, or another machine does."""
+    """Fail, because dora or another machine refuses the dataflow or a request."""
     code = _FINAL.get(event.cause, RunnerExit.FAILED)
     return fail(because(cell, event.cause), event.reason, code)
 
@@ -63,7 +63,7 @@ def fail(cell: Cell, reason: str, code: RunnerExit, **more: str) -> Next:
 
 
 def child_exited(cell: Cell, event: life.ChildExited) -> Next:
-    """A dataflow cannot run without coordinator or daemon."""
+    """Fail after the exit of coordinator or daemon."""
     reason = f"the dora {event.child} is gone ({event.exit})"
     cell, actions = _lose(cell, event.child, reason, event.exit, event.oom)
     return cell, (*oom_of_all(event), *actions)
@@ -82,13 +82,13 @@ def _lose(cell: Cell, child: str, reason: str, exit: Exit, oom: Oom | None = Non
 
 
 def engine_deadline(cell: Cell, event: life.Event) -> Next:  # noqa: ARG001 - as all handlers
-    """dora does not answer in time."""
+    """Fail, because dora does not answer in time."""
     reason = f"dora did not answer within {ENGINE_TIMEOUT // SECOND} s while {cell.state.value}"
     return fail(because(cell, Cause.NO_ANSWER), reason, RunnerExit.ENGINE_LOST)
 
 
 def oom_of_all(event: life.Event) -> tuple[Action, ...]:
-    """The event about the dataflow, if its own memory limit caused the kill."""
+    """Return the event about the dataflow, if its own memory limit caused the kill."""
     if not isinstance(event, life.NodeExited | life.ChildExited) or event.oom is None:
         return ()
     if event.oom.owner is not Owner.DATAFLOW:

@@ -39,27 +39,27 @@ CASCADE_TIMEOUT = 5 * SECOND
 
 
 def ignore(cell: Cell, event: life.Event) -> Next:
-    """The event has no effect in this state."""
+    """Leave the cell as it is, because the event has no effect in this state."""
     return cell, ()
 
 
 def listening(cell: Cell, event: life.Event) -> Next:
-    """The coordinator listens: start the daemon."""
+    """Start the daemon, because the coordinator listens."""
     return to(cell, State.JOINING, Do.START_DAEMON, after=ENGINE_TIMEOUT)
 
 
 def joined(cell: Cell, event: life.Event) -> Next:
-    """The daemon has registered: send the descriptor."""
+    """Send the descriptor, because the daemon has registered."""
     return to(cell, State.STARTING, Do.SEND_START, after=ENGINE_TIMEOUT)
 
 
 def started(cell: Cell, event: life.RunStarted) -> Next:
-    """Dora has accepted the descriptor: subscribe to the events of the run."""
+    """Subscribe to the events of the run, after dora has accepted the descriptor."""
     return replace(cell, run=event.run), (Do.SUBSCRIBE,)
 
 
 def subscribed(cell: Cell, event: life.Event) -> Next:
-    """The subscription is active: no event of a node gets lost from here on."""
+    """Open the pipes, because with the active subscription no event of a node gets lost."""
     # Launchers wait for OPEN_PIPES, so their nodes cannot end before this. Nodes that dora starts
     # without a launcher can, and no event would report that: ASK_RESULT queries whether the run has
     # ended.
@@ -67,7 +67,7 @@ def subscribed(cell: Cell, event: life.Event) -> Next:
 
 
 def barrier_opened(cell: Cell, event: life.Event) -> Next:
-    """Dora opened its start barrier: the dataflow runs, unless a node failed before."""
+    """Let the dataflow run after dora has opened its start barrier, unless a node failed before."""
     # Dora also opens the barrier after a node ended before it was ready, and then fails the other
     # nodes: RunFinished follows. If it does not follow within CASCADE_TIMEOUT, the dataflow runs.
     if any(node.state == "failed" for node in cell.nodes.values()) or early.is_doomed(cell):
@@ -141,7 +141,7 @@ def _stopping(event: life.StopAsked) -> Record:
 
 
 def node_event_stopping(cell: Cell, event: life.Event) -> Next:
-    """A node event while stopping: dismiss the daemon after the last node has exited."""
+    """Record a node event while stopping; dismiss the daemon after the last node has exited."""
     cell, actions = node_event(cell, event)
     if table.has_process(cell.nodes):
         return cell, actions
@@ -171,9 +171,9 @@ def wind_down(cell: Cell, *actions: Action) -> Next:
 
 
 def stop_again(cell: Cell, event: life.StopAsked) -> Next:
-    """A stop while stopping: a second request skips the grace period, any other replaces a reload.
+    """Handle a stop while stopping: skip the grace period, or turn a reload into a stop.
 
-    stop_by is empty while a reload or a failed trial stops the nodes; then a stop takes over.
+    stop_by is empty while a reload or a failed trial stops the nodes.
     """
     if cell.stop_by:
         return _leave(cell)
@@ -192,7 +192,7 @@ def note_reload(cell: Cell, event: life.ReloadNoted) -> Next:
 
 
 def node_event_waiting(cell: Cell, event: life.NodeExited) -> Next:
-    """A node exited before the start barrier: fail the start, or keep a held node waiting.
+    """Handle the exit of a node before the start barrier: fail the start, or keep a held node.
 
     A node with the policy HELD waits for a reload after it failed. That is no help while the start
     can still fail: on the first run, and in a trial, where the version before can come back.
@@ -222,7 +222,7 @@ def run_finished(cell: Cell, event: life.Event) -> Next:
 
 
 def result(cell: Cell, event: life.ResultKnown) -> Next:
-    """The results of the nodes decide between a finished and a failed dataflow."""
+    """Decide by the results of the nodes between a finished and a failed dataflow."""
     event = replace(event, results=early.blamed_results(event.results))
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
@@ -267,12 +267,12 @@ def end(cell: Cell, event: life.Event) -> Next:
 
 
 def raised_leaving(cell: Cell, event: life.Failed) -> Next:
-    """The result is known by now, and stays; but no run follows that should have."""
+    """Keep the known result after an exception, but fail if another run should follow."""
     return broken(cell, event) if cell.reload else end(cell, event)
 
 
 def _exit_of_stop(cell: Cell) -> RunnerExit:
-    """A requested stop of a service counts as clean, whatever exit status the nodes had.
+    """Return the exit status of a requested stop, which counts as clean for a service.
 
     `doractl run` ends as `dora run` does, which fails if a node failed on the way out, but not if
     dora's SIGTERM after the grace has ended it. For its unit that status is a success: the stop
@@ -291,7 +291,7 @@ def _has_failed_at_stop(node: NodeStatus, grace_ends_us: int) -> bool:
 
 
 def daemon_left(cell: Cell, event: life.ChildExited) -> Next:
-    """The daemon has exited, which is the last thing to wait for."""
+    """End the cell when the daemon has exited."""
     return end(cell, event) if event.child == "daemon" else (cell, ())
 
 
@@ -305,14 +305,14 @@ def node_exited(cell: Cell, event: life.NodeExited) -> Next:
 
 
 def reload_noted(cell: Cell, event: life.ReloadNoted) -> Next:
-    """A reload is over: end the dataflow if it has failed, and left an essential node failed."""
+    """Record the end of a reload; end the dataflow if the reload left an essential node failed."""
     after, actions = note_reload(cell, event)
     lost = [node for node in event.essential if _is_lost(after, node)]
     return _without(after, lost[0], actions) if lost else (after, actions)
 
 
 def node_reloading(cell: Cell, event: life.Event) -> Next:
-    """A reload replaces or adds a node: what the one before has reported is not true any more."""
+    """Record that a reload replaces or adds a node; the notice of the last reload ends."""
     return node_event(replace(cell, notice=""), event)
 
 

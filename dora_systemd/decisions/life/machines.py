@@ -45,7 +45,7 @@ def joined(cell: Cell, event: life.DaemonConnected) -> Next:
 
 
 def awaited(cell: Cell, event: life.MachinesAwaited) -> Next:
-    """Show what is missing."""
+    """Show which members are missing."""
     return replace(cell, awaited=event.text), ()
 
 
@@ -108,7 +108,7 @@ def _stopped_there(cell: Cell, event: life.MachineLost) -> Cell:
 
 
 def machine_lost_stopping(cell: Cell, event: life.MachineLost) -> Next:
-    """A member is gone while dora stops all: it would wait for that machine."""
+    """End the nodes without dora, which would wait for the lost member during its stop."""
     if not any(
         cell.nodes[node].machine == event.machine for node in table.with_process(cell.nodes)
     ):
@@ -146,12 +146,12 @@ def head_lost(cell: Cell, event: life.HeadLost) -> Next:
 
 
 def head_lost_stopping(cell: Cell, event: life.HeadLost) -> Next:
-    """The head is gone while dora stops all: do not wait for it."""
+    """End the nodes without dora, because the head is lost while dora stops all nodes."""
     return _end_nodes(cell, event)
 
 
 def end_early(cell: Cell, event: life.HeadLost | life.HeadStops) -> Next:
-    """The head is gone before any node of a member runs."""
+    """End a member whose head stops or is lost before any of its nodes runs."""
     by = event.by if isinstance(event, life.HeadStops) else HEAD
     return handle.stop_early(cell, life.StopAsked(event.at_us, by))
 

@@ -43,7 +43,7 @@ def with_process(nodes: NodeTable) -> list[str]:
 
 
 def all_ready(nodes: NodeTable, at_us: int) -> NodeTable:
-    """The table after dora has opened its start barrier."""
+    """Return the table after dora has opened its start barrier."""
     return {
         ident: node._replace(state="running", since_us=at_us) if node.state == "ready" else node
         for ident, node in nodes.items()
@@ -125,7 +125,7 @@ def _told_to_end(nodes: NodeTable, event: life.NodeAsked | life.NodeReloading) -
 
 
 def _reloading(nodes: NodeTable, event: life.NodeReloading) -> NodeTable:
-    """The new process has its own restart counter."""
+    """Record a reload of a node, whose new process has its own restart counter."""
     old = nodes.get(event.node, NodeStatus())
     status = (event.status or old)._replace(state="reloading", pid=old.pid, since_us=event.at_us)
     if old.needs:  # the new process waits as well
@@ -291,9 +291,9 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
 
 
 def _is_of_another(old: NodeStatus, event: life.NodeExited) -> bool:
-    """Whether a node that has ended has ended already, and this is of another process.
+    """Whether an exit after the end of a node is of another process.
 
-    That is its launcher, which ends as the node did, or the process that it has replaced.
+    Such a process is the launcher, which ends as the node did, or the process before a reload.
     """
     is_launcher = old.state == "failed" and old.policy == "never" and event.exit == old.exit
     return is_launcher or (old.state in ("failed", "finished") and not (old.pid or old.machine))
@@ -312,7 +312,7 @@ def _exited_as_told(nodes: NodeTable, event: life.NodeExited, old: NodeStatus) -
 
 
 def with_downstream(record: Record, downstream: Downstream) -> Record:
-    """The life event; that of a failed node names the nodes downstream of it."""
+    """Add the nodes downstream of a failed node to its life event."""
     fed = downstream.get(record.node)
     if record.event not in FAILURES or not fed:
         return record
@@ -359,7 +359,7 @@ def _restarts(count: int) -> str:
 
 
 def apply_results(nodes: NodeTable, results: Mapping[str, Exit], at_us: int) -> NodeTable:
-    """The table with dora's results, which have causes that no event has."""
+    """Add dora's results to the table, which have causes that no event has."""
     for ident, how in results.items():
         if ident in nodes and is_stopped(nodes[ident]):
             continue

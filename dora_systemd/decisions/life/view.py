@@ -142,7 +142,7 @@ def has_started(cell: Cell) -> bool:
 
 
 def is_up(cell: Cell) -> bool:
-    """Whether READY=1 is due: it has started, or ends well without that.
+    """Whether READY=1 is due: the dataflow has started, or ends well without a start.
 
     systemd calls the end of a service that was never ready a failure, whatever its exit status.
     """
@@ -157,7 +157,7 @@ def cell_status(
     lines: Mapping[str, LineCount],
     signs: Mapping[str, Sign],
 ) -> CellStatus:
-    """The table for status.json."""
+    """Return the table for status.json."""
     return CellStatus(
         uuid=uuid,
         run=cell.run,
@@ -187,7 +187,7 @@ def _max_restarts(raw: Mapping[str, Any]) -> int:
 def initial_nodes(
     kinds: Mapping[str, str], descriptor: Mapping[str, Any], at_us: int
 ) -> dict[str, NodeStatus]:
-    """The initial table.
+    """Return the initial table of nodes.
 
     kinds: node id -> how dora starts it. descriptor: as sent to dora.
     """

@@ -214,8 +214,8 @@ def surplus(
 ) -> list[str]:
     """Return the releases to remove, oldest first: all but `keep`.
 
-    Releases without a passed trial are removed before those with one, older before newer. The
-    current release, the release before it and those of `used` stay in any case.
+    Releases that have passed no trial, or were rolled back from, are removed before others, older
+    before newer. The current release, the one before it and those of `used` stay in any case.
     """
     bad = marks(history)
     ids = sorted((one.id for one in releases), reverse=True)

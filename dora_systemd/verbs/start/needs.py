@@ -150,7 +150,7 @@ def _sandbox_warnings(nodes: tuple[NodeNeed, ...], allowed: tuple[str, ...]) -> 
 
 
 def held_notes(manager: Manager, name: str) -> Iterator[str]:
-    """Yield what a start without --wait waits for, while systemd holds the start."""
+    """Yield what a start with --no-wait waits for, while systemd holds the start."""
     if needs := format_awaited(manager.awaited(unit_name(name))):
         yield format_wait(START, needs, 0)
 
