@@ -33,18 +33,15 @@ _MORE = "Why: doractl why NAME; all runs: doractl logs NAME --run ALL"
 
 
 class ListRequest(NamedTuple):
-    """A `doractl list` command. is_user: None without --user and --system.
-
-    last: the maximum number of ended dataflows. status, pattern, sort_by: see matching_rows() and
-    sorted_rows().
-    """
+    """A `doractl list` command."""
 
     selector: str | None = None
     want_all: bool = False
     output: str = "table"
-    is_user: bool | None = None
+    is_user: bool | None = None  # None without --user and --system
     is_quiet: bool = False
-    last: int | None = None
+    last: int | None = None  # the maximum number of ended dataflows
+    # status, pattern, sort_by: see matching_rows() and sorted_rows()
     status: str | None = None
     pattern: str | None = None
     sort_by: str | None = None

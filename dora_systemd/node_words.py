@@ -18,11 +18,12 @@ _BETWEEN = re.compile(r",(?![0-9])")
 
 
 class NodeWords(NamedTuple):
-    """What such a text is about. singular, plural: for messages. example: assignments."""
+    """What such a text is about."""
 
+    # singular, plural: for messages
     singular: str
     plural: str
-    example: str
+    example: str  # assignments
 
 
 def parse_node_words(

@@ -34,17 +34,14 @@ STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class Place(NamedTuple):
-    """The end of a walk.
-
-    uid: owner of the file or directory. owners: owners of it and of all directories above it.
-    shared: a directory on the way, or at the end, in which users other than its owner can replace
-    entries, or "".
-    """
+    """The end of a walk."""
 
     path: str
-    uid: int
+    uid: int  # owner of the file or directory
     mode: int
-    owners: frozenset[int]
+    owners: frozenset[int]  # owners of it and of all directories above it
+    # a directory on the way, or at the end, in which users other than its owner can replace
+    # entries, or ""
     shared: str = ""
 
     @property

@@ -36,12 +36,10 @@ identity (48 bytes) and three numbers, see linux/inet_diag.h."""
 
 
 class Owner(NamedTuple):
-    """The owner of a socket.
-
-    inode: 0 if its process has closed it. Kernels before Linux 6.16 then report uid 0.
-    """
+    """The owner of a socket."""
 
     uid: int
+    # 0 if its process has closed it. Kernels before Linux 6.16 then report uid 0
     inode: int
 
 

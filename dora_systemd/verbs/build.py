@@ -79,11 +79,11 @@ Show = Callable[[str], None]
 
 
 class Project(NamedTuple):
-    """A project to build. user: who builds, "" for the caller. lock: uv.lock's directory, or ""."""
+    """A project to build."""
 
     dataflow: str
-    user: str
-    lock: str
+    user: str  # who builds, "" for the caller
+    lock: str  # uv.lock's directory, or ""
     commands: tuple[tuple[str, ...], ...]
     environment: Mapping[str, str]
 

@@ -16,10 +16,10 @@ _READY_SECONDS = 30.0
 
 @dataclass(frozen=True)
 class Gateway:
-    """Whether the gateway's port is open. port: None if it has no unit."""
+    """Whether the gateway's port is open."""
 
     is_up: bool
-    port: int | None
+    port: int | None  # None if it has no unit
 
 
 def read_gateway(manager: Manager) -> Gateway:

@@ -91,11 +91,12 @@ def _oldest_first(query: LogQuery) -> LogQuery:
 
 
 class Span(NamedTuple):
-    """A range of records in the journal. first, last: times for journalctl. cursor: of the last."""
+    """A range of records in the journal."""
 
+    # first, last: times for journalctl
     first: str
     last: str
-    cursor: str
+    cursor: str  # of the last
 
 
 def find_span(query: LogQuery) -> Span | None:

@@ -84,16 +84,12 @@ def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
 
 @dataclass(frozen=True)
 class NodeOrder:
-    """A request for one node. what: RESTART or STOP of decisions/cell/status.py.
+    """A request for one node."""
 
-    by: the command or page, such as "doractl node stop". grace: µs that the node's process has to
-    end; None: that of the dataflow.
-    """
-
-    what: str
+    what: str  # RESTART or STOP of decisions/cell/status.py
     node: str
-    by: str
-    grace: int | None = None
+    by: str  # the command or page, such as "doractl node stop"
+    grace: int | None = None  # µs that the node's process has to end; None: that of the dataflow
 
 
 def order_node(

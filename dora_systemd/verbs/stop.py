@@ -36,19 +36,19 @@ Clock = Callable[[], float]
 
 @dataclass(frozen=True)
 class Ended:
-    """A dataflow with a requested stop. note: how it ended, or "". problem: why it has not."""
+    """A dataflow with a requested stop."""
 
     cell: Cell
-    note: str = ""
-    problem: str = ""
+    note: str = ""  # how it ended, or ""
+    problem: str = ""  # why it has not
 
 
 @dataclass(frozen=True)
 class _Stop:
-    """A stop in progress. deadline: seconds of the monotonic clock."""
+    """A stop in progress."""
 
     cell: Cell
-    deadline: float
+    deadline: float  # seconds of the monotonic clock
     is_killed: bool
     was_frozen: bool = False
 

@@ -26,17 +26,14 @@ StageObserver = Callable[[str], None]
 
 
 class UnitState(NamedTuple):
-    """One unit as ListUnits reports it, in the terms of `systemctl list-units`.
-
-    job: the type of the job that is queued for it, "" if there is none.
-    """
+    """One unit as ListUnits reports it, in the terms of `systemctl list-units`."""
 
     unit: str
     load: str
     active: str
     sub: str
     description: str = ""
-    job: str = ""
+    job: str = ""  # the type of the job that is queued for it, "" if there is none
 
     @property
     def is_held(self) -> bool:

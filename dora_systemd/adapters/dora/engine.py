@@ -55,13 +55,13 @@ def free_port() -> int:
 
 @dataclass(frozen=True)
 class Child:
-    """One child process. output: read end of its stdout and stderr. `said`: the output so far."""
+    """One child process."""
 
     label: str
     popen: "subprocess.Popen[bytes]"
     pidfd: int
-    output: int
-    said: bytearray = field(default_factory=bytearray)
+    output: int  # read end of its stdout and stderr
+    said: bytearray = field(default_factory=bytearray)  # the output so far
 
     def send_signal(self, number: signal.Signals) -> None:
         """Send the child a signal, but never another process that has reused its pid."""

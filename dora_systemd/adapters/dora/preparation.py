@@ -40,14 +40,11 @@ PACKAGE = Path(__file__).parents[2]
 
 @dataclass(frozen=True)
 class Prepared:
-    """A dataflow that can be started.
+    """A dataflow that can be started."""
 
-    dataflow: with modules expanded. descriptor: what dora gets.
-    """
-
-    dataflow: Dataflow
+    dataflow: Dataflow  # with modules expanded
     plan: LaunchPlan
-    descriptor: Mapping[str, Any]
+    descriptor: Mapping[str, Any]  # what dora gets
 
 
 def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:

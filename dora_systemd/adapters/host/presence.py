@@ -14,13 +14,13 @@ _MOST_LINKS = 40
 
 
 class Presence(NamedTuple):
-    """The state of a path. reason: why it cannot be used, or "". identity: of a device.
+    """The state of a path.
 
     A device that was unplugged and plugged in between two looks has another identity.
     """
 
-    reason: str = ""
-    identity: tuple[int, int, int] | None = None
+    reason: str = ""  # why it cannot be used, or ""
+    identity: tuple[int, int, int] | None = None  # of a device
 
 
 def look_at(path: str) -> Presence:

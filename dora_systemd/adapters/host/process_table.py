@@ -101,13 +101,13 @@ def _holds(directory: Path, inodes: Collection[int]) -> bool:
 
 
 class LockProcess(NamedTuple):
-    """A process. uid: its effective user. inner_pid: in its own PID namespace. group: cgroup."""
+    """A process."""
 
     pid: int
-    uid: int
-    inner_pid: int
+    uid: int  # its effective user
+    inner_pid: int  # in its own PID namespace
     command: str
-    group: str
+    group: str  # cgroup
 
 
 def read_flocks(device: int) -> Mapping[int, tuple[int, ...]]:

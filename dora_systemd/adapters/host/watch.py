@@ -37,10 +37,10 @@ class Identity(NamedTuple):
     """The values that distinguish one version of a file from another.
 
     Times alone do not: the clock may be set back, a file server has its own clock, and a file that
-    was moved to the path may be older than the file before. path: without links.
+    was moved to the path may be older than the file before.
     """
 
-    path: str
+    path: str  # without links
     device: int
     inode: int
     size: int
@@ -59,13 +59,11 @@ def identity(path: str) -> Identity | None:
 
 
 class Since(NamedTuple):
-    """The start of a run of the dataflow, with which the first check of the files compares.
+    """The start of a run of the dataflow, with which the first check of the files compares."""
 
-    at_ns: CLOCK_MONOTONIC, before the run reads any file. known: returns the versions of files that
-    the run was started from; the first check calls it, in a thread.
-    """
-
-    at_ns: int
+    at_ns: int  # CLOCK_MONOTONIC, before the run reads any file
+    # returns the versions of files that the run was started from; the first check calls it, in a
+    # thread
     known: Callable[[], Iterable[tuple[str, Identity | None]]] = tuple
 
 

@@ -54,31 +54,25 @@ _MOST_RECORDS = 1000
 
 @dataclass(frozen=True)
 class LastEvent:
-    """The last life event of a dataflow in the journal.
-
-    event: such as "dataflow-failed"; a "dataflow-started" of a dataflow that systemd has unloaded
-    means that its runner was killed, or that the machine lost power. at_us: CLOCK_REALTIME, µs.
-    detail: exit status or reason, or "". cursor: its place in the journal.
-    """
+    """The last life event of a dataflow in the journal."""
 
     name: str
     uuid: str
+    # such as "dataflow-failed"; a "dataflow-started" of a dataflow that systemd has unloaded means
+    # that its runner was killed, or that the machine lost power
     event: str
-    at_us: int
-    detail: str
-    cursor: str = ""
+    at_us: int  # CLOCK_REALTIME, µs
+    detail: str  # exit status or reason, or ""
+    cursor: str = ""  # its place in the journal
 
 
 class Bounds(NamedTuple):
-    """The limits of one call.
+    """The limits of one call."""
 
-    size: maximum bytes. first_seconds: timeout for the first record: journalctl may have to open
-    large files on a slow disk. seconds: timeout after the first record.
-    """
-
-    size: int = 32 * 1024 * 1024
+    size: int = 32 * 1024 * 1024  # maximum bytes
+    # timeout for the first record: journalctl may have to open large files on a slow disk
     first_seconds: float = 20.0
-    seconds: float = 2.0
+    seconds: float = 2.0  # timeout after the first record
 
 
 _BOUNDS = Bounds()

@@ -71,10 +71,10 @@ class _Lane:
 
 @dataclass
 class _Event:
-    """An event of the whole dataflow. behind: nodes whose earlier entries must be sent first."""
+    """An event of the whole dataflow."""
 
     entry: bytes
-    behind: set[str]
+    behind: set[str]  # nodes whose earlier entries must be sent first
 
 
 class LogQueue:

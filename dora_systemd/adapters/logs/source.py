@@ -27,12 +27,13 @@ OnLine = Callable[[str], None] | None
 
 @dataclass
 class Pipe:
-    """One stream of a node. fd: non-blocking. since, taken: for is_flood()."""
+    """One stream of a node."""
 
-    fd: int
+    fd: int  # non-blocking
     stream: str
     encoder: LineEncoder
     splitter: LineSplitter = field(default_factory=LineSplitter)
+    # since, taken: for is_flood()
     since: float = 0.0
     taken: int = 0
     # Keeps the bytes that journald does not have; number of such batches.
@@ -125,16 +126,14 @@ class Source:
 
 @dataclass
 class LineBatch:
-    """The entries of one read. They are made late, because raw bytes take less memory.
-
-    data: what was read from `pipe`. lines, suppressed: for a node with a rate limit, which had to
-    count the lines at once: the lines of `data` that may pass, and the number of the others.
-    """
+    """The entries of one read. They are made late, because raw bytes take less memory."""
 
     source: Source
     pipe: Pipe
     encoder: LineEncoder
-    data: bytes
+    data: bytes  # what was read from `pipe`
+    # lines, suppressed: for a node with a rate limit, which had to count the lines at once: the
+    # lines of `data` that may pass, and the number of the others
     lines: list[bytes] | None = None
     suppressed: int = 0
     passed: int = 0

@@ -44,10 +44,10 @@ def _short(path: Path) -> Iterator[str]:
 
 
 class Kept(NamedTuple):
-    """A connection. `said`: the bytes that were received."""
+    """A connection."""
 
     connection: socket.socket
-    said: bytes
+    said: bytes  # the bytes that were received
 
 
 class Door:

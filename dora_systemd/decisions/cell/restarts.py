@@ -178,10 +178,10 @@ def budget_words(budget: Mapping[str, int | None]) -> str:
 
 
 class Budget(NamedTuple):
-    """The remaining restarts of a unit. used: in this window. resets_in: µs, or None."""
+    """The remaining restarts of a unit."""
 
-    used: int
-    resets_in: int | None
+    used: int  # in this window
+    resets_in: int | None  # µs, or None
 
 
 def unit_budget(

@@ -30,13 +30,13 @@ _DORA_SOURCES = "dora/"
 
 @dataclass(frozen=True)
 class Dataflow:
-    """A descriptor. source: the name of its file in messages. raw: the complete mapping."""
+    """A descriptor."""
 
-    source: str
+    source: str  # the name of its file in messages
     nodes: tuple[Node, ...]
     env: Mapping[str, object]
     exit_when_nodes_finish: bool | None
-    raw: Mapping[str, object] = field(repr=False)
+    raw: Mapping[str, object] = field(repr=False)  # the complete mapping
 
     def node(self, node_id: str) -> Node | None:
         """The node with that id, or None."""

@@ -51,12 +51,12 @@ _TOLD = {RESTART: "Node `{}` restart initiated", STOP: "Node `{}` stopped"}
 
 
 class NodeCommand(NamedTuple):
-    """One such command. dataflow: its name or UUID, "" if it is not given. grace: µs, or None."""
+    """One such command."""
 
     what: str
     node: str
-    dataflow: str = ""
-    grace: int | None = None
+    dataflow: str = ""  # its name or UUID, "" if it is not given
+    grace: int | None = None  # µs, or None
 
     @property
     def told(self) -> str:

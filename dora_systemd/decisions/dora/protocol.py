@@ -25,20 +25,20 @@ _ENDED_ALREADY = re.compile(r"unknown dataflow\b")
 
 @dataclass(frozen=True)
 class Reply:
-    """The reply to request `id`. error: "" or dora's text. result: that of a good reply."""
+    """The reply to request `id`."""
 
     id: str
-    result: Any
-    error: str
+    result: Any  # that of a good reply
+    error: str  # "" or dora's text
 
 
 @dataclass(frozen=True)
 class LogRecord:
-    """One line of dora's event stream. node: "" if it is about the whole dataflow."""
+    """One line of dora's event stream."""
 
     level: str
     target: str
-    node: str
+    node: str  # "" if it is about the whole dataflow
     message: str
 
 

@@ -42,11 +42,11 @@ _MICROSECOND_NS = 1000
 
 @dataclass(frozen=True)
 class Request:
-    """One request. name: a variant of dora's ControlRequest. body: its fields."""
+    """One request."""
 
     id: str
-    name: str
-    body: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # a variant of dora's ControlRequest
+    body: Mapping[str, Any] = field(default_factory=dict)  # its fields
 
     @property
     def params(self) -> str | dict[str, Any]:
@@ -89,10 +89,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Malformed:
-    """A frame that is not a request. reason: for the reply."""
+    """A frame that is not a request."""
 
     id: str
-    reason: str
+    reason: str  # for the reply
 
 
 def parse_request(text: str | bytes) -> Request | Malformed:

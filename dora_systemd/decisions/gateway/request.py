@@ -28,11 +28,12 @@ class Request:
 
 @dataclass(frozen=True)
 class Answer:
-    """An HTTP response. headers: in addition to Content-Type and Content-Length."""
+    """An HTTP response."""
 
     status: int
     content_type: str
     body: bytes
+    # in addition to Content-Type and Content-Length
     headers: Mapping[str, str] = field(default_factory=dict)
 
 

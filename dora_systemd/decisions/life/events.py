@@ -30,9 +30,9 @@ class DaemonConnected(Event):
 
 @dataclass(frozen=True)
 class RunStarted(Event):
-    """The coordinator has accepted the descriptor. run: dora's own id of this run."""
+    """The coordinator has accepted the descriptor."""
 
-    run: str
+    run: str  # dora's own id of this run
 
 
 class Subscribed(Event):
@@ -41,9 +41,9 @@ class Subscribed(Event):
 
 @dataclass(frozen=True)
 class Refused(Event):
-    """The dataflow cannot start or continue. reason: one line."""
+    """The dataflow cannot start or continue."""
 
-    reason: str
+    reason: str  # one line
     cause: Cause = Cause.REFUSED
 
 
@@ -131,10 +131,10 @@ class NodeSpeaks(Event):
 
 @dataclass(frozen=True)
 class NodeLacks(Event):
-    """The node must not run: something that it needs is missing. needs: what (human-readable)."""
+    """The node must not run: something that it needs is missing."""
 
     node: str
-    needs: str
+    needs: str  # what is missing (human-readable)
 
 
 @dataclass(frozen=True)
@@ -157,9 +157,9 @@ class RunFinished(Event):
 
 @dataclass(frozen=True)
 class ResultKnown(Event):
-    """dora's results of an ended run. results: by node id; empty: unknown."""
+    """dora's results of an ended run."""
 
-    results: Mapping[str, Exit] = field(default_factory=dict)
+    results: Mapping[str, Exit] = field(default_factory=dict)  # by node id; empty: unknown
 
 
 @dataclass(frozen=True)
@@ -181,9 +181,9 @@ class ConnectionLost(Event):
 
 @dataclass(frozen=True)
 class StopAsked(Event):
-    """A stop request. by: SIGTERM, SIGINT or, if attached, the end of standard input."""
+    """A stop request."""
 
-    by: str
+    by: str  # SIGTERM, SIGINT or, if attached, the end of standard input
 
 
 class StopAnswered(Event):
@@ -211,10 +211,10 @@ class NodeReloading(Event):
 
 @dataclass(frozen=True)
 class NodeAdded(Event):
-    """The node is new in the descriptor. status: its initial status."""
+    """The node is new in the descriptor."""
 
     node: str
-    status: NodeStatus
+    status: NodeStatus  # its initial status
 
 
 @dataclass(frozen=True)
@@ -239,9 +239,9 @@ class ReloadAsked(Event):
 
 @dataclass(frozen=True)
 class MachinesAwaited(Event):
-    """A member is not connected. text: which one and why (human-readable)."""
+    """A member is not connected."""
 
-    text: str
+    text: str  # which one and why (human-readable)
 
 
 @dataclass(frozen=True)
@@ -268,9 +268,9 @@ class MachineLost(Event):
 
 @dataclass(frozen=True)
 class HeadStops(Event):
-    """To a member: the head has dora stop all nodes. by: who requested the stop of the head."""
+    """To a member: the head has dora stop all nodes."""
 
-    by: str
+    by: str  # who requested the stop of the head
 
 
 @dataclass(frozen=True)

@@ -61,10 +61,10 @@ class Do(Enum):
 
 @dataclass(frozen=True)
 class Record:
-    """Action: write a life event of decisions/logs/journal_events.py. node: "" for the dataflow."""
+    """Action: write a life event of decisions/logs/journal_events.py."""
 
     event: str
-    node: str = ""
+    node: str = ""  # "" for the dataflow
     details: Mapping[str, str] = field(default_factory=dict)
 
 

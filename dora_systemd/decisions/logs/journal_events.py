@@ -12,11 +12,11 @@ from dora_systemd.decisions.logs.lines import ERR, INFO, NOTICE, WARNING
 
 @dataclass(frozen=True)
 class EventKind:
-    """One kind of event. text: may contain `{dataflow}`, `{node}` and `{count}`."""
+    """One kind of event."""
 
     message_id: str
     priority: int
-    text: str
+    text: str  # may contain `{dataflow}`, `{node}` and `{count}`
 
 
 def _dataflow(message_id: str, priority: int, text: str) -> EventKind:

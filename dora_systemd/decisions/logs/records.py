@@ -103,10 +103,10 @@ FILTER_LEVELS = (*DORA_LEVELS[1:], RAW)
 
 @dataclass(frozen=True)
 class LogFilter:
-    """The levels to show. nodes: those of single nodes by id; level: of all other records."""
+    """The levels to show."""
 
-    level: str = RAW
-    nodes: Mapping[str, str] = field(default_factory=dict)
+    level: str = RAW  # of all records but those of `nodes`
+    nodes: Mapping[str, str] = field(default_factory=dict)  # the levels of single nodes by id
 
     def shows(self, record: Record) -> bool:
         """Whether to show the record: raw lines only at the level "stdout", as in dora."""

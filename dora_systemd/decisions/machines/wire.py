@@ -44,9 +44,9 @@ class Forwards:
 
 @dataclass(frozen=True)
 class Lost:
-    """Link to the runner of the head: ssh has ended. words: its last line, or why there is none."""
+    """Link to the runner of the head: ssh has ended."""
 
-    words: str
+    words: str  # its last line, or why there is none
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ class Beat:
 
 @dataclass(frozen=True)
 class Ready:
-    """Member to head: its daemon has joined. work: its directory for dora, absolute."""
+    """Member to head: its daemon has joined."""
 
-    work: str
+    work: str  # its directory for dora, absolute
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ class Programs:
 
 @dataclass(frozen=True)
 class Hung:
-    """Member to head: a node there is about to be ended. record: the life event, see NodeHung."""
+    """Member to head: a node there is about to be ended."""
 
     node: str
     reason: str
-    record: str
+    record: str  # the life event, see NodeHung
 
 
 @dataclass(frozen=True)
@@ -149,9 +149,9 @@ class StopPart:
 
 @dataclass(frozen=True)
 class Stopping:
-    """Head to member: the head is about to have dora stop all nodes. by: who requested that."""
+    """Head to member: the head is about to have dora stop all nodes."""
 
-    by: str = ""
+    by: str = ""  # who requested that
 
 
 RUNNER_ENDED = "its supervisor process has ended"
@@ -160,11 +160,11 @@ RUNNER_ENDED = "its supervisor process has ended"
 
 @dataclass(frozen=True)
 class Asked:
-    """Head to member: a restart or stop of one of the member's nodes was requested. by: who."""
+    """Head to member: a restart or stop of one of the member's nodes was requested."""
 
     node: str
     what: str
-    by: str
+    by: str  # who requested that
 
 
 @dataclass(frozen=True)
@@ -176,9 +176,9 @@ class Check:
 
 @dataclass(frozen=True)
 class Checked:
-    """Member to head: the answer to a Check. reason: why its part could not start again, or ""."""
+    """Member to head: the answer to a Check."""
 
-    reason: str = ""
+    reason: str = ""  # why its part could not start again, or ""
     hint: str = ""
 
 

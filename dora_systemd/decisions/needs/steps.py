@@ -23,11 +23,11 @@ class Do(Enum):
 
 
 class NeedStep(NamedTuple):
-    """One step. needs: what the node waits for (human-readable)."""
+    """One step."""
 
     do: Do
     node: str
-    needs: str = ""
+    needs: str = ""  # what the node waits for (human-readable)
 
 
 def need_steps(

@@ -171,10 +171,10 @@ UNKNOWN = "unknown"
 
 
 class Known(NamedTuple):
-    """A release in the store. is_proved: it has passed a trial."""
+    """A release in the store."""
 
     id: str
-    is_proved: bool
+    is_proved: bool  # whether it has passed a trial
 
 
 def state_of(one: Known, current: str, trial: str, mark: Switch | None = None) -> str:

@@ -9,10 +9,10 @@ SHORT, LONG = "-H", "--host"
 
 
 class Parted(NamedTuple):
-    """A command line. hosts: the values of its -H options. words: all the others."""
+    """A command line."""
 
-    hosts: list[str]
-    words: list[str]
+    hosts: list[str]  # the values of its -H options
+    words: list[str]  # all the others
 
 
 def part_hosts(words: Sequence[str], valued_of: Callable[[str], Set[str]]) -> Parted:

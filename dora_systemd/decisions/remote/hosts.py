@@ -28,12 +28,13 @@ _MAX_PORT = 65535
 
 
 class Host(NamedTuple):
-    """A host. text: as the user wrote it. destination, port: for ssh(1); port may be "".
+    """A host.
 
     Without a destination it is this machine.
     """
 
-    text: str
+    text: str  # as the user wrote it
+    # destination, port: for ssh(1); port may be ""
     destination: str
     port: str = ""
 

@@ -19,10 +19,11 @@ _UNKNOWN = "-"
 
 
 class Verdict(NamedTuple):
-    """The result of one host. word: human-readable. release, former: ids, or ""."""
+    """The result of one host."""
 
     host: str
-    word: str
+    word: str  # human-readable
+    # release, former: ids, or ""
     release: str = ""
     former: str = ""
 

@@ -16,10 +16,10 @@ HOST = "host"
 
 
 class Declared(NamedTuple):
-    """A machine as it is written. values: by key. bases: of each source; None is a flag."""
+    """A machine as it is written."""
 
-    values: Mapping[str, Any]
-    bases: tuple[Base, ...]
+    values: Mapping[str, Any]  # by key
+    bases: tuple[Base, ...]  # of each source; None is a flag
 
 
 Machines = Mapping[str, Declared]

@@ -26,13 +26,13 @@ _RATE_DEFAULTS = {"RateLimitIntervalSec": "30s", "RateLimitBurst": "10000"}
 
 @dataclass(frozen=True)
 class Process:
-    """One process. group: its cgroup. is_node: started by dora's daemon, or by such a process."""
+    """One process."""
 
     pid: int
     parent: int
     command: tuple[str, ...]
-    group: str = ""
-    is_node: bool = False
+    group: str = ""  # its cgroup
+    is_node: bool = False  # started by dora's daemon, or by such a process
 
     @property
     def engine(self) -> str:

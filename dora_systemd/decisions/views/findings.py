@@ -19,12 +19,12 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding. remedy: a command or a sentence, "" if everything is fine."""
+    """One finding."""
 
     topic: str
     state: State
     text: str
-    remedy: str = ""
+    remedy: str = ""  # a command or a sentence, "" if everything is fine
 
 
 def has_problem(findings: Sequence[Finding]) -> bool:

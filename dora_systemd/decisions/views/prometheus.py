@@ -29,10 +29,11 @@ STATES = tuple(sorted(word.lower() for word in (*UP_WORDS, STOPPED, FAILED)))
 
 @dataclass(frozen=True)
 class Family:
-    """One metric. value: of one group, None if it has none; nodes elsewhere have no Strain here."""
+    """One metric."""
 
     name: str
     help: str
+    # of one group, None if it has none; nodes elsewhere have no Strain here
     value: Callable[[Usage, Strain | None], float | int | None] = lambda _use, _strain: None
 
     @property

@@ -28,17 +28,18 @@ _MOST_WORDS = 40
 
 @dataclass(frozen=True)
 class TopEntry:
-    """A dataflow with its nodes. waits: by node, WHOLE_CELL is the whole dataflow."""
+    """A dataflow with its nodes."""
 
     row: DataflowRow
+    # by node, WHOLE_CELL is the whole dataflow
     waits: Mapping[str, Shares] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Look:
-    """The content of one screen. at_us: CLOCK_REALTIME."""
+    """The content of one screen."""
 
-    at_us: int
+    at_us: int  # CLOCK_REALTIME
     entries: Sequence[TopEntry] = ()
 
 

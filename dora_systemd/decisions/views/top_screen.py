@@ -36,16 +36,16 @@ _FRAME = 3
 
 
 class Line(NamedTuple):
-    """One line of a screen. style: words out of bold, reverse, red, yellow."""
+    """One line of a screen."""
 
     text: str
-    style: str = ""
+    style: str = ""  # words out of bold, reverse, red, yellow
 
 
 class Change(NamedTuple):
-    """A change to make to a row. action: "stop" or "restart"."""
+    """A change to make to a row."""
 
-    action: str
+    action: str  # "stop" or "restart"
     row: TopRow
 
     def __str__(self) -> str:

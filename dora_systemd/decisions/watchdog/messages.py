@@ -15,11 +15,11 @@ MAX_STATUS = 200
 
 
 class Message(NamedTuple):
-    """One message. status: the text of STATUS=, None without one; "" clears the last text."""
+    """One message."""
 
     is_alive: bool = False
     is_trigger: bool = False
-    status: str | None = None
+    status: str | None = None  # the text of STATUS=, None without one; "" clears the last text
 
 
 def parse_message(data: bytes) -> Message:

@@ -20,9 +20,9 @@ _LIBRARIES = ("dora_", "zenoh")
 
 @dataclass(frozen=True)
 class Word:
-    """One line of a node. at_us: CLOCK_REALTIME µs; of the last one, if it came several times."""
+    """One line of a node."""
 
-    at_us: int
+    at_us: int  # CLOCK_REALTIME µs; of the last one, if it came several times
     node: str
     text: str
     times: int = 1

@@ -49,13 +49,13 @@ _HELD = (
 
 @dataclass(frozen=True)
 class Subject:
-    """The dataflow of a verdict. file: its descriptor, "" if that is not known any more."""
+    """The dataflow of a verdict."""
 
     uuid: str
     name: str
     unit: str
     flag: str
-    file: str = ""
+    file: str = ""  # its descriptor, "" if that is not known any more
     is_loaded: bool = False
 
 

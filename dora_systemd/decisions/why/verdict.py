@@ -30,12 +30,12 @@ class Facts:
 
 @dataclass(frozen=True)
 class Restart:
-    """One restart. owner: "dora" for a node, "systemd" for the dataflow. reason: its cause."""
+    """One restart."""
 
     at_us: int
-    owner: str
+    owner: str  # "dora" for a node, "systemd" for the dataflow
     node: str
-    reason: str
+    reason: str  # its cause
 
 
 @dataclass(frozen=True)

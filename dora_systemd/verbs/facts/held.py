@@ -20,10 +20,10 @@ _FACTS = ("StateChangeTimestampMonotonic", "Transient", "FragmentPath")
 
 
 class Held(NamedTuple):
-    """What a start waits for, "" if it begins right now. since_us: CLOCK_REALTIME µs."""
+    """What a start waits for, "" if it begins right now."""
 
     needs: str
-    since_us: int
+    since_us: int  # CLOCK_REALTIME µs
 
     @property
     def word(self) -> str:

@@ -33,26 +33,21 @@ _ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, _TEXT, _READY_AT, PROCES
 
 
 class Reading(NamedTuple):
-    """One reading of a dataflow: its state from systemd and its runner, and usage of its groups.
-
-    unit: properties of its unit; NRestarts without a restart that was refused. problem: why its
-    node table is not usable, or "". groups, usage: by node, with the unit's own as WHOLE_CELL;
-    empty for a dataflow that is not running. at_us: time of the reading, CLOCK_MONOTONIC. `heard`:
-    the last message of each owed output, on the same clock, 0 is never. held: what systemd waits
-    for before it starts the dataflow. is_frozen: whether the unit is frozen, see
-    `systemctl freeze`.
-    """
+    """One reading of a dataflow: its state from systemd and its runner, and usage of its groups."""
 
     cell: Cell
-    unit: Mapping[str, Any]
+    unit: Mapping[str, Any]  # properties of its unit; NRestarts without a restart that was refused
     status: CellStatus = CellStatus()
-    problem: str = ""
+    problem: str = ""  # why its node table is not usable, or ""
+    # groups, usage: by node, with the unit's own as WHOLE_CELL; empty for a dataflow that is not
+    # running
     groups: Mapping[str, Path] = {}
     usage: Mapping[str, Usage] = {}
-    at_us: int = 0
+    at_us: int = 0  # time of the reading, CLOCK_MONOTONIC
+    # the last message of each owed output, on the same clock, 0 is never
     heard: tuple[int, ...] = ()
-    held: "Held | None" = None
-    is_frozen: bool = False
+    held: "Held | None" = None  # what systemd waits for before it starts the dataflow
+    is_frozen: bool = False  # whether the unit is frozen, see `systemctl freeze`
 
     @property
     def word(self) -> str:

@@ -61,15 +61,12 @@ _PASSING = (ExitCode.FAILURE, ExitCode.NO_SYSTEMD)
 
 @dataclass(frozen=True)
 class MemberRequest:
-    """The command line. start: what to run, with name, UUID, nodes and the name of this machine.
-
-    address_seconds: until this machine must have its address. end_seconds: for a part of a former
-    start to end; an attempt later may find it gone.
-    """
+    """The command line."""
 
     scope: Scope
-    start: StartRequest
-    address_seconds: float = 10.0
+    start: StartRequest  # what to run, with name, UUID, nodes and the name of this machine
+    address_seconds: float = 10.0  # until this machine must have its address
+    # for a part of a former start to end; an attempt later may find it gone
     end_seconds: float = 60.0
 
     @property

@@ -27,10 +27,10 @@ _MICROSECOND_NS = 1000
 
 
 class Probe(NamedTuple):
-    """The description of a machine. skew: µs that its clock is ahead of ours."""
+    """The description of a machine."""
 
     facts: Facts
-    skew: int
+    skew: int  # µs that its clock is ahead of ours
 
 
 def probe_as_caller(host: Host) -> Probe:

@@ -41,11 +41,11 @@ _NEW_MODE = 0o644
 
 @dataclass(frozen=True)
 class Known:
-    """A machine of a config.yml. key: the file of its own key, or "" for the keys of the caller."""
+    """A machine of a config.yml."""
 
     name: str
     host: Host
-    key: str
+    key: str  # the file of its own key, or "" for the keys of the caller
 
 
 def known_machines(scope: Scope, environment: Mapping[str, str]) -> list[Known]:

@@ -73,19 +73,17 @@ _LEFT_OUT_OF_CACHE = (*_LEFT_OUT, "build", "deps", "examples", "incremental", ".
 
 @dataclass(frozen=True)
 class Build:
-    """A build of a release of `source`.
-
-    release, uuid: ids of the release and the dataflow. timeout: µs. on_line: gets the last line
-    of the build's output, "" before the first, at each check of the unit.
-    """
+    """A build of a release of `source`."""
 
     scope: Scope
     source: Source
     store: Store
+    # release, uuid: ids of the release and the dataflow
     release: str
     uuid: str
     commands: Sequence[Sequence[str]]
-    timeout: int
+    timeout: int  # µs
+    # gets the last line of the build's output, "" before the first, at each check of the unit
     on_line: Callable[[str], None]
 
     @property

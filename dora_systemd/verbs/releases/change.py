@@ -47,20 +47,16 @@ from dora_systemd.verbs.start.start import make_room
 
 @dataclass(frozen=True)
 class Change:
-    """A release that is to run. text: its unit file. soak: µs. verb: "deploy" or "rollback".
-
-    how: what to do while a lock inhibits the change. by: the command that requests the change, as
-    in note_request().
-    """
+    """A release that is to run."""
 
     release: str
-    text: str
+    text: str  # its unit file
     options: RunnerOptions
-    soak: int
+    soak: int  # µs
     want_boot: bool
-    verb: str
-    how: IfInhibited
-    by: str
+    verb: str  # "deploy" or "rollback"
+    how: IfInhibited  # what to do while a lock inhibits the change
+    by: str  # the command that requests the change, as in note_request()
 
 
 class Trial(Protocol):

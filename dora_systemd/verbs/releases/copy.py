@@ -30,14 +30,11 @@ _MICROSECOND_NS = 1000
 
 
 class Copied(NamedTuple):
-    """A copied project. copied: bytes of its files that the last release does not have.
-
-    notes: warnings about the last release (human-readable).
-    """
+    """A copied project."""
 
     manifest: Manifest
-    copied: int
-    notes: tuple[str, ...] = ()
+    copied: int  # bytes of its files that the last release does not have
+    notes: tuple[str, ...] = ()  # warnings about the last release (human-readable)
 
 
 def newest(store: Store) -> Manifest | None:

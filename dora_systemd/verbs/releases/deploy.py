@@ -58,26 +58,20 @@ BUILD_TIMEOUT = 30 * 60 * SECOND
 
 @dataclass(frozen=True)
 class DeployRequest:
-    """A deploy. start: as of `doractl start`; its dataflow may be a directory. soak: µs.
+    """A request to deploy a project."""
 
-    how: what to do while a lock inhibits it; FORCE also deploys what has not changed.
-    build_timeout: µs; 0: without a build. may_wait: as of Gate.
-    """
-
-    start: StartRequest
-    soak: int
-    keep: int
+    start: StartRequest  # as of `doractl start`; its dataflow may be a directory
+    soak: int  # µs
+    keep: int  # releases
     want_boot: bool
+    # what to do while a lock inhibits the deploy; FORCE also deploys what has not changed
     how: IfInhibited = IfInhibited.REFUSE
-    build_timeout: int = BUILD_TIMEOUT
-    may_wait: bool = False
+    build_timeout: int = BUILD_TIMEOUT  # µs; 0: without a build
+    may_wait: bool = False  # as of Gate
 
 
 class Deployed(NamedTuple):
-    """A release that runs. size: bytes of its files; copied: of those that no other one has.
-
-    is_unchanged: it ran before, and the project and the settings have not changed since.
-    """
+    """A release that runs."""
 
     uuid: str
     name: str
@@ -85,8 +79,9 @@ class Deployed(NamedTuple):
     release: str
     former: str
     files: int
-    size: int
-    copied: int
+    size: int  # bytes of its files
+    copied: int  # bytes of its files that no other release has
+    # whether it ran before, and the project and the settings have not changed since
     is_unchanged: bool = False
 
 

@@ -22,11 +22,11 @@ _COMMAND = "doractl forget"
 
 
 class Kept(NamedTuple):
-    """The files that are kept of a dataflow. uuid: "" if unknown. releases: their ids."""
+    """The files that are kept of a dataflow."""
 
     name: str
-    uuid: str
-    releases: tuple[str, ...]
+    uuid: str  # "" if unknown
+    releases: tuple[str, ...]  # their ids
 
     @property
     def unit(self) -> str:

@@ -47,9 +47,9 @@ Warn = Callable[[str], None]
 
 
 class Known(NamedTuple):
-    """The files that are here already, unchanged. tree: where they are."""
+    """The files that are here already, unchanged."""
 
-    tree: Path
+    tree: Path  # where they are
     files: Mapping[str, Stored]
 
 

@@ -44,16 +44,14 @@ class Packed(NamedTuple):
 
 
 class Sender(NamedTuple):
-    """A project to send. directory: its working directory, "" for that of the dataflow file.
-
-    `beside`: the content of the settings file next to the dataflow file, None without one.
-    """
+    """A project to send."""
 
     place: Place
     dataflow: Dataflow
     settings: Settings
     root: str
-    directory: str
+    directory: str  # its working directory, "" for that of the dataflow file
+    # the content of the settings file next to the dataflow file, None without one
     beside: bytes | None
 
 

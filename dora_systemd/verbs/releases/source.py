@@ -26,25 +26,20 @@ from dora_systemd.verbs.start.where import account_of, find_uv
 
 @dataclass(frozen=True)
 class Source:
-    """A project. root: its directory. origin: of its files, whose owner limits their settings.
+    """A project."""
 
-    plan: of a start from root. named: files that the dataflow names, relative to root. read: the
-    contents of files that decide what root does, None for a missing file. dora, uv: the commands
-    that have something to build, "" otherwise. is_moving: whether these may build another program
-    from the same files. sent: from where another host has sent the project, or "". revision: of
-    git, for a project that was sent.
-    """
-
-    root: str
-    origin: Place
-    plan: Plan
-    named: tuple[str, ...]
+    root: str  # its directory
+    origin: Place  # of its files, whose owner limits their settings
+    plan: Plan  # of a start from root
+    named: tuple[str, ...]  # files that the dataflow names, relative to root
+    # the contents of files that decide what root does, None for a missing file
     read: Mapping[str, bytes | None]
+    # dora, uv: the commands that have something to build, "" otherwise
     dora: str = ""
     uv: str = ""
-    is_moving: bool = False
-    sent: str = ""
-    revision: str = ""
+    is_moving: bool = False  # whether these may build another program from the same files
+    sent: str = ""  # from where another host has sent the project, or ""
+    revision: str = ""  # of git, for a project that was sent
 
     @property
     def own_venv(self) -> str | None:

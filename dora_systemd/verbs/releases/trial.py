@@ -49,17 +49,13 @@ KILLED = "the command that tried it was killed"
 
 @dataclass(frozen=True)
 class Standing:
-    """The state of a dataflow before its release changes.
+    """The state of a dataflow before its release changes."""
 
-    boot: its unit file. path: of the unit file of a trial. trial: the release on trial, or "".
-    cell: the loaded dataflow, or None. has_trial: whether the file of a trial exists.
-    """
-
-    boot: BootUnit
-    path: Path
-    trial: str
-    cell: Cell | None
-    has_trial: bool
+    boot: BootUnit  # its unit file
+    path: Path  # of the unit file of a trial
+    trial: str  # the release on trial, or ""
+    cell: Cell | None  # the loaded dataflow, or None
+    has_trial: bool  # whether the file of a trial exists
 
     @property
     def current(self) -> str:

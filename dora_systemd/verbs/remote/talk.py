@@ -41,15 +41,12 @@ class Said(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """The end of doractl on a host. error: why it was not reached, or is lost.
-
-    was_in: whether doractl had begun there.
-    """
+    """The end of doractl on a host."""
 
     host: Host
     status: int
-    error: DoraSystemdError | None
-    was_in: bool = False
+    error: DoraSystemdError | None  # why it was not reached, or is lost
+    was_in: bool = False  # whether doractl had begun there
 
 
 Event = Said | Ended | None

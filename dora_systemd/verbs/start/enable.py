@@ -47,18 +47,15 @@ _RETRY_SECONDS = 0.02
 
 @dataclass(frozen=True)
 class BootUnit:
-    """The unit file of one dataflow, if there is one.
-
-    path: where it is or would be. runtime: its path in the directory that a reboot empties. text,
-    options: of the file at `path`, None without a file. is_wanted: a target starts the unit.
-    """
+    """The unit file of one dataflow, if there is one."""
 
     unit: str
-    path: Path
-    runtime: Path
+    path: Path  # where it is or would be
+    runtime: Path  # its path in the directory that a reboot empties
+    # text, options: of the file at `path`, None without a file
     text: str | None
     options: RunnerOptions | None
-    is_wanted: bool
+    is_wanted: bool  # a target starts the unit
 
     @property
     def is_enabled(self) -> bool:

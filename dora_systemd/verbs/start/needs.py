@@ -30,10 +30,10 @@ _HIDDEN = ("/tmp/", "/var/tmp/")
 
 
 class Needy(NamedTuple):
-    """A dataflow with needs. name: of the dataflow. is_user: in a user's manager."""
+    """A dataflow with needs."""
 
-    name: str
-    is_user: bool
+    name: str  # of the dataflow
+    is_user: bool  # in a user's manager
     needs: tuple[str, ...]
 
 

@@ -15,11 +15,7 @@ DEFAULT_FILE = "dataflow.yml"
 
 @dataclass(frozen=True)
 class StartRequest:
-    """A request to start a dataflow.
-
-    machine, head, placed, addresses: of the runner's options, if this machine is a member of the
-    dataflow.
-    """
+    """A request to start a dataflow."""
 
     dataflow: str
     name: str | None = None
@@ -31,6 +27,8 @@ class StartRequest:
     # root, who owns the copy
     origin: Place | None = None
     is_unbuilt: bool = False  # a build may make the programs of its nodes, see Plan.missing
+    # machine, head, placed, addresses: of the runner's options, if this machine is a member of the
+    # dataflow
     machine: str = ""
     head: str = ""
     placed: tuple[Placed, ...] = ()

@@ -37,12 +37,12 @@ _INIT = "1"
 
 @dataclass(frozen=True)
 class Asked:
-    """A recorded request of a start. flags: as in StartRequest, with absolute paths."""
+    """A recorded request of a start."""
 
     name: str
     uuid: str
     dataflow: str
-    flags: Mapping[str, object]
+    flags: Mapping[str, object]  # as in StartRequest, with absolute paths
 
     @property
     def unit(self) -> str:

@@ -41,9 +41,10 @@ from dora_systemd.verbs.start.unit import plan_links, plan_properties, systemd_n
 
 @dataclass(frozen=True)
 class Claim:
-    """A dataflow whose name is free. properties, links: for start_unit()."""
+    """A dataflow whose name is free."""
 
     plan: Plan
+    # properties, links: for start_unit()
     properties: Sequence[Property] | None
     warnings: tuple[str, ...]
     links: Beside = ()

@@ -35,12 +35,12 @@ _POLL_SECONDS = 0.2
 
 @dataclass(frozen=True)
 class Started:
-    """A dataflow that has been started. is_ready: whether its nodes are ready."""
+    """A dataflow that has been started."""
 
     uuid: str
     name: str
     unit: str
-    is_ready: bool
+    is_ready: bool  # whether its nodes are ready
 
 
 def start_unit(
