@@ -22,8 +22,12 @@ lost = pytest.mark.warns(*LOST)
 killed = pytest.mark.warns(
     "Main process exited, code=killed, status=9/KILL", "Failed with result 'signal'"
 )
-BUSY = ("node exited with error: Signal(15)", "State 'stop-post' timed out")
-"""Of a machine that gives a node too little time within the grace, or systemd's last command."""
+BUSY = (
+    *("node exited with error: Signal(15)", "State 'stop-post' timed out"),
+    *("failed to send log message to dora-coordinator", "WS send channel closed"),
+)
+"""Of a machine that gives a node too little time within the grace, or systemd's last command, or
+whose daemon still has something to report when the coordinator of the head has ended."""
 
 
 def _journalctl(machine: str, *words: str) -> str:

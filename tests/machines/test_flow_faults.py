@@ -14,7 +14,6 @@ from tests.system.cells import run, wait_for
 @lost
 @killed
 @pytest.mark.warns("SIGKILL", "b: systemd: dora-flow")
-@pytest.mark.warns("flow/daemon: dora_daemon: daemon disconnected from coordinator: ")
 @pytest.mark.parametrize(
     ("machine", "pattern"),
     [
