@@ -93,8 +93,12 @@ def plan_check(_form: str) -> list[Step]:
 
 
 def unit_step(options: Sequence[str]) -> Step:
-    """On all processors: a worker that has no tests left takes over some of another's."""
-    command = ["python", "-m", "pytest", "tests/unit", "-n", "auto", "--dist=worksteal"]
+    """One more worker than processors, since tests wait now and then for a child or a timeout.
+
+    A worker that has no tests left takes over some of another's.
+    """
+    workers = str((os.cpu_count() or 1) + 1)
+    command = ["python", "-m", "pytest", "tests/unit", "-n", workers, "--dist=worksteal"]
     version = ".".join(map(str, sys.version_info[:2]))
     return Step(f"unit tests, Python {version}", [*command, *options], in_venv, minutes=1)
 
