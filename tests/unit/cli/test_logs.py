@@ -2,6 +2,7 @@
 
 import pytest
 
+from dora_systemd.cli.group import doractl
 from dora_systemd.cli.verbs.look.logs import command, last_count
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -26,13 +27,15 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
     ],
 )
 def test_boot(words: str, boot: str, selectors: tuple[str, ...]) -> None:
-    params = command.make_context("logs", words.split()).params
+    params = command.make_context("logs", words.split(), **doractl.context_settings).params
     assert (params["boot"], params["selectors"]) == (boot, selectors)
 
 
 @pytest.mark.parametrize("option", ["-n 5", "-n5", "--lines 5", "--lines=5", "--tail=5", "-qn 5"])
 def test_lines(option: str) -> None:
-    params = command.make_context("logs", [*option.split(), "robot"]).params
+    params = command.make_context(
+        "logs", [*option.split(), "robot"], **doractl.context_settings
+    ).params
     assert (params["counts"], params["selectors"]) == (("5",), ("robot",))
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.cli.group import doractl
 from dora_systemd.cli.remote import machines
 from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.remote.run import run_on_all
@@ -37,7 +38,7 @@ def systemd(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def found(*words: str) -> tuple[list[Host], Plan] | None:
-    with command.make_context("logs", list(words)) as context:
+    with command.make_context("logs", list(words), **doractl.context_settings) as context:
         return machines.find_machines(scope_of(None), context)
 
 
@@ -127,7 +128,7 @@ def test_a_member_that_says_nothing_holds_up_nobody(
 
 def test_another_scope_is_not_merged(capsys: pytest.CaptureFixture[str]) -> None:
     other = scope_of(os.getuid() == 0)
-    with command.make_context("logs", ["robot"]) as context:
+    with command.make_context("logs", ["robot"], **doractl.context_settings) as context:
         assert machines.print_machines(other, context) is None
     assert "the logs of gpu are left out" in capsys.readouterr().err
 
