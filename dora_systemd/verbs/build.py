@@ -21,11 +21,10 @@ from dora_systemd.adapters.bus.manager import Manager, is_at_rest
 from dora_systemd.decisions.cell.environment import unit_environment
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.options import build_command
-from dora_systemd.decisions.cell.uv import uv_project
+from dora_systemd.decisions.cell.uv import LOCK, find_lock, uv_project
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.releases.build import (
-    LOCK,
     BuildTask,
     format_task,
     project_commands,
@@ -53,7 +52,6 @@ from dora_systemd.verbs.start.check import exec_start
 from dora_systemd.verbs.start.read import Files, read_files
 from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.start.settings import settings_of
-from dora_systemd.verbs.start.startable import find_lock
 from dora_systemd.verbs.start.where import (
     Look,
     account_of,
@@ -162,7 +160,7 @@ def _check_user(read: Read) -> None:
 def _project(read: Read) -> Project:
     settings, look, path = read.look.settings, read.look, read.dataflow.source
     home = str(Path.home()) if look.user is None else look.user.pw_dir
-    search_path = read.request.environment.get("PATH") or os.defpath
+    search_path = read.request.search_path
     lock = _find_lock(read)
     uv = find_uv(search_path, look.sight, home)
     if lock and not uv:
@@ -189,7 +187,7 @@ def _find_lock(read: Read) -> str:
     places = [str(path.parent), root]
     if look.settings[UV] and (above := uv_project(look.directory, look.sight.read)):
         places.insert(0, above)
-    found = find_lock(places, look.sight)
+    found = find_lock(places, look.sight.exists)
     given = look.settings[VENV]
     is_own = given is None or str(Path(given).absolute()).startswith(f"{found}/")
     return found if is_own else ""

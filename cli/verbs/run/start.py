@@ -5,6 +5,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache, partial
 from typing import Any
 
 import click
@@ -108,10 +109,11 @@ def command(
             return _start_known(bus, scope, known, not no_wait)
         request = known.request(request)
     if dry_run:
-        target = boot_target(Bus(scope), scope) if want_boot else None
+        connect = cache(partial(Bus, scope))
+        target = boot_target(connect(), scope) if want_boot else None
         plan = make_plan(scope, request)
-        check_plan(lambda: Bus(scope), plan)
-        write_exactly(format_plan(plan, lambda: Bus(scope), target))
+        check_plan(connect, plan)
+        write_exactly(format_plan(plan, connect, target))
         return ExitCode.OK
     bus = Bus(scope)
     if want_push:

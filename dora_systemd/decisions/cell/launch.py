@@ -16,10 +16,15 @@ from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import base_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS
-from dora_systemd.decisions.cell.uv import Read, uv_project
+from dora_systemd.decisions.cell.uv import Read, find_lock, uv_project
 from dora_systemd.decisions.descriptor.dataflow import BuildSession, Dataflow
 from dora_systemd.decisions.descriptor.expansion import expanded
-from dora_systemd.decisions.descriptor.nodes import Node, NodeKind, split_arguments
+from dora_systemd.decisions.descriptor.nodes import (
+    Node,
+    NodeKind,
+    operator_file,
+    split_arguments,
+)
 from dora_systemd.decisions.watchdog.watchdogs import watchdog_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, as_mapping, quoted, shown
@@ -211,9 +216,7 @@ def _node_sources(node: Node, source: str, plan: LaunchPlan) -> Iterator[tuple[s
     if node.kind is NodeKind.OPERATOR:
         raw = _with_absolute_operators(dict(node.raw), plan.options.working_directory)
         for operator in (raw.get("operator"), *(raw.get("operators") or ())):
-            python = operator.get("python") if isinstance(operator, Mapping) else None
-            file = python.get("source") if isinstance(python, Mapping) else python
-            if isinstance(file, str):
+            if isinstance(file := operator_file(operator), str):
                 yield str(operator.get("id") or DEFAULT_OPERATOR), file
 
 
@@ -232,7 +235,7 @@ def _hint(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
     if node.build:
         return _build_hint(source, plan)
     places = dict.fromkeys((directory, plan.options.working_directory))
-    locked = next((one for one in places if plan.exists(f"{one}/uv.lock")), None)
+    locked = find_lock(places, plan.exists)
     if locked and "/" not in node.path:  # a console script of a package
         return f"{_build_hint(source, plan)}, or correct the path of the node"
     return "correct the path of the node"

@@ -1,8 +1,12 @@
-"""Finds the project that `uv run` works in, by the rules of uv."""
+"""Finds the project that `uv run` works in, by the rules of uv, and the lock of a project."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import PurePath
 from typing import Any
+
+from dora_systemd.values import as_list, as_mapping
+
+LOCK = "uv.lock"
 
 Read = Callable[[str], bytes]
 """The content of a file by absolute path; raises OSError."""
@@ -12,6 +16,11 @@ _Workspace = Mapping[str, Any] | None
 
 _MOST_BYTES = 64 * 1024
 """Maximum bytes of a pyproject.toml: tomllib takes long for a large one with odd keys."""
+
+
+def find_lock(places: Iterable[str], exists: Callable[[str], bool]) -> str:
+    """Find the first of some directories that has a uv.lock; "" if none has."""
+    return next((one for one in places if exists(f"{one}/{LOCK}")), "")
 
 
 def uv_project(directory: str, read: Read) -> str | None:
@@ -49,14 +58,14 @@ def _parse(data: bytes) -> _Workspace:
     except (ValueError, RecursionError):
         table = None  # uv reports it
     for key in ("tool", "uv", "workspace"):
-        table = table.get(key) if isinstance(table, dict) else None
+        table = as_mapping(table).get(key)
     return table if isinstance(table, dict) else None
 
 
 def _is_listed(key: str, place: PurePath, above: PurePath, workspace: _Workspace) -> bool:
     """Whether a pattern of the workspace at `above` matches the project at `place`."""
-    patterns = (workspace or {}).get(key)
-    texts = [one for one in patterns if isinstance(one, str)] if isinstance(patterns, list) else []
+    patterns = as_list((workspace or {}).get(key))
+    texts = [one for one in patterns if isinstance(one, str)]
     # With a "/" in front, a pattern is for the whole path.
     project = PurePath("/", place.relative_to(above))
     return any(project.match(f"/{one}") for one in texts)

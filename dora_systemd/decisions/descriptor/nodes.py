@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from dora_systemd.decisions.descriptor.json_size import refusal
 from dora_systemd.names import MAX_NODE_ID, NODE_ID, did_you_mean
-from dora_systemd.values import quoted, scalar_text
+from dora_systemd.values import as_mapping, quoted, scalar_text
 
 _RESERVED_IDS = frozenset({"dora"})
 _OUTPUT_KEYS = ("send_stdout_as", "send_logs_as", "min_log_level")
@@ -149,6 +149,12 @@ def _operators(
     for operator in _sequence(node.get("operators"), source, f"{what}: 'operators'"):
         part = mapping_of(operator, source, f"{what}: an operator")
         yield f"{text_of(part.get('id'))}/", part
+
+
+def operator_file(operator: object) -> object:
+    """The `python` of an operator, which is a file or a mapping with one."""
+    python = as_mapping(operator).get("python")
+    return python.get("source") if isinstance(python, dict) else python
 
 
 def _inputs(node: Mapping[str, object], source: str, what: str) -> Iterator[Input]:

@@ -6,12 +6,12 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import PurePath
 
+from dora_systemd.decisions.cell.uv import LOCK
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.terminal_text import short_line, without_sequences
 from dora_systemd.values import as_list, as_mapping
 
-LOCK = "uv.lock"
 _LONGEST = 300
 """Maximum characters of a line of the build in an error or on a terminal."""
 _OF_NODE = re.compile(r"(?P<node>[\w.-]+): +(?P<level>stdout|stderr|[A-Z]+) +(?P<text>\S.*)")

@@ -24,6 +24,7 @@ from dora_systemd.decisions.releases.entries import (
 from dora_systemd.decisions.releases.manifest import format_stored, is_revision, parse_stored
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name
+from dora_systemd.values import as_mapping
 
 SCHEMA = 1
 MOST_HEAD = 64 * 1024 * 1024
@@ -113,7 +114,7 @@ def format_wants(numbers: Iterable[int]) -> str:
 
 def parse_wants(value: Any, parcel: Parcel) -> list[Stored] | None:
     """Parse an answer to the contents that the host requests; None for an invalid answer."""
-    wants, contents = value.get("wants") if isinstance(value, dict) else None, parcel.contents
+    wants, contents = as_mapping(value).get("wants"), parcel.contents
     if not isinstance(wants, list) or len(wants) > len(contents):
         return None
     if not all(type(one) is int and 0 <= one < len(contents) for one in wants):

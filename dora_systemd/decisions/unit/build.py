@@ -53,20 +53,12 @@ def build_properties(
     if not any(slot.startswith("MemoryMax") for slot in kept):
         kept = with_assignments(kept, [f"MemoryMax={_MEMORY}"])
     binds, hidden = (_values(kept, key) for key in ("BindPaths", "TemporaryFileSystem"))
-    kept |= typed(
-        Type="oneshot",
+    kept |= _of_builds(environment) | typed(
         NotifyAccess="main",
-        WorkingDirectory="/",
         # A venv and a program can contain the path that they were built at.
         TemporaryFileSystem=(*hidden, (releases, "ro")),
         BindPaths=(*binds, (tree, place, False, MS_REC)),
-        Environment=environment_entries(environment),
         TimeoutStartSec=timeout,
-        TimeoutStopSec=_STOP,
-        KillMode="control-group",
-        CPUWeight=_SHARES,
-        IOWeight=_SHARES,
-        TasksMax=_MOST_TASKS,
         LimitFSIZE=MOST_BYTES,
     )
     # A user's manager has no mounts without a user namespace, see systemd.exec(5).
@@ -79,13 +71,16 @@ def project_build_properties(user: str, environment: Mapping[str, str]) -> dict[
     It has the rights of `user` and no sandbox, as if that user had built: caches in the home
     directory count.
     """
+    own = typed(User=user, NoNewPrivileges=True, TimeoutStartSec=INFINITY)
+    return _of_builds(environment) | own
+
+
+def _of_builds(environment: Mapping[str, str]) -> dict[str, Property]:
+    """The properties of every build."""
     return typed(
         Type="oneshot",
-        User=user,
         WorkingDirectory="/",
         Environment=environment_entries(environment),
-        NoNewPrivileges=True,
-        TimeoutStartSec=INFINITY,
         TimeoutStopSec=_STOP,
         KillMode="control-group",
         CPUWeight=_SHARES,

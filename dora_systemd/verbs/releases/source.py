@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind, operator_file
 from dora_systemd.decisions.releases.build import built_nodes, has_builds, is_moving, lock_places
 from dora_systemd.decisions.releases.entries import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
@@ -216,16 +216,11 @@ def _programs(dataflow: Dataflow, working_directory: str) -> Iterator[str]:
     for node in dataflow.nodes:
         raw = node.raw
         operators = [raw.get("operator"), *as_list(raw.get("operators"))]
-        values = [node.path, raw.get("module"), *(_operator_file(one) for one in operators)]
+        values = [node.path, raw.get("module"), *(operator_file(one) for one in operators)]
         for one in values:
             if isinstance(one, str) and one and "://" not in one:
                 directory = Path(working_directory, node.working_directory)
                 yield str(directory / one)
-
-
-def _operator_file(raw: object) -> object:
-    python = raw.get("python") if isinstance(raw, Mapping) else None
-    return python.get("source") if isinstance(python, Mapping) else python
 
 
 def _is_below(path: str, directory: str) -> bool:

@@ -1,5 +1,6 @@
 """The request of a start: its first stage."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,11 @@ class StartRequest:
     head: str = ""
     placed: tuple[Placed, ...] = ()
     addresses: tuple[str, ...] = ()
+
+    @property
+    def search_path(self) -> str:
+        """The PATH of the caller."""
+        return self.environment.get("PATH") or os.defpath
 
 
 def request_name(request: StartRequest) -> str:

@@ -2,14 +2,14 @@
 
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from dora_systemd.adapters.dora.preparation import check_named_nodes
 from dora_systemd.adapters.host.files import absolute_path, decoded, parse_yaml
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.uv import uv_project
+from dora_systemd.decisions.cell.uv import LOCK, find_lock, uv_project
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
     Dataflow,
@@ -17,7 +17,6 @@ from dora_systemd.decisions.descriptor.dataflow import (
     session_path,
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
-from dora_systemd.decisions.releases.build import LOCK
 from dora_systemd.decisions.settings.credentials import CREDENTIALS, MAX_SIZE
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.sandbox import NETWORK
@@ -99,15 +98,10 @@ def _nodes_venv(options: RunnerOptions, sight: Sight) -> str | None:
 def unbuilt_warnings(options: RunnerOptions, sight: Sight) -> Iterator[str]:
     """Warn of a project that uv has not built yet: its nodes would run without its packages."""
     places = dict.fromkeys((str(Path(options.dataflow).parent), options.working_directory))
-    locked = find_lock(places, sight)
+    locked = find_lock(places, sight.exists)
     if locked and options.venv is None and not options.uv:  # else uv makes it
         build = f"doractl build {shown(options.dataflow)}"
         yield f"{shown(locked)} has {LOCK} and the nodes have no .venv; to make it: {build}"
-
-
-def find_lock(places: Iterable[str], sight: Sight) -> str:
-    """Find the first of some directories that has a uv.lock; "" if none has."""
-    return next((one for one in places if sight.exists(f"{one}/{LOCK}")), "")
 
 
 def _is_build_old(dataflow: Dataflow, sight: Sight) -> bool:

@@ -143,7 +143,7 @@ def find_where(
 ) -> Where:
     """Find programs and machines. Raises DoraSystemdError."""
     path, settings = dataflow.source, look.settings
-    search_path = request.environment.get("PATH") or os.defpath
+    search_path = request.search_path
     venv = look.find_venv(path, request.environment, request.is_unbuilt)
     variables = given_variables(settings, look.sight)
     look.check_reach(path)

@@ -16,16 +16,15 @@ from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy
 from dora_systemd.verbs.releases.listing import read_releases, store_of
 from dora_systemd.verbs.start.request import StartRequest
-from tests.unit.fakes.manager import ScopeIn
+from tests.unit.fakes.manager import PrintingManager, ScopeIn
 from tests.unit.fakes.programs import make_dora
-from tests.unit.verbs.start.test_check import CheckingManager
 
 UNIT = "dora-robot.service"
 FLOW = "nodes: [{id: a, path: a.py}]\n"
 VERSIONS = b"versions: dora=1.1.0 python=3.12.1\n"
 
 
-class Systemd(CheckingManager):
+class Systemd(PrintingManager):
     """A start loads the unit file with the highest precedence. state: of what is on trial.
 
     TREE in what a check says stands for the directory of its dataflow. on_start: called at each

@@ -1,5 +1,6 @@
 """A systemd of a few dicts: what the use cases of doractl are tested against."""
 
+import os
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -223,3 +224,28 @@ class FakeManager:
     def _end(self, unit: str) -> str:
         self.units[unit] |= self.after_job.get(unit, {})
         return self.job_results.get(unit, JOB_DONE)
+
+
+class PrintingManager(FakeManager):
+    """A manager whose units print `said` and `refusal`, and end with `status`."""
+
+    def __init__(self, said: bytes = b"", status: int = 0, refusal: bytes = b"") -> None:
+        super().__init__()
+        self.said, self.status, self.refusal = said, status, refusal
+        self.given: dict[str, Any] = {}  # properties of the last unit, by name
+
+    def start_transient(
+        self,
+        unit: str,
+        properties: Sequence[Property],
+        observer: Observer | None,
+        wait: bool,
+        beside: Beside = (),
+    ) -> str:
+        self.given = {name: value for name, _, value in properties}
+        os.write(self.given["StandardOutputFileDescriptor"], self.said)
+        if self.refusal:
+            os.write(self.given["StandardErrorFileDescriptor"], self.refusal)
+        self.after_job[unit] = {"ActiveState": "inactive", "Job": (0, "/")}
+        self.after_job[unit] |= {"ExecMainCode": 1, "ExecMainStatus": self.status}
+        return super().start_transient(unit, properties, observer, wait, beside)

@@ -1,18 +1,17 @@
 """A build of a project where it is: by whom, with which commands, and how it ends."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.bus.manager import Beside, Observer, Property
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.build import Project, _run_unit, _Runner, build, find_project
 from dora_systemd.verbs.start.request import StartRequest
-from tests.unit.fakes.manager import FakeManager
+from tests.unit.fakes.manager import FakeManager, PrintingManager
 from tests.unit.fakes.programs import make_program
 
 USER = Scope(is_user=True, uid=1000)
@@ -157,30 +156,6 @@ def test_no_home_directory(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert found(root).environment["UV_NO_CACHE"] == "1"
 
 
-class Builder(FakeManager):
-    """Its unit writes `said` and ends with `status`."""
-
-    def __init__(self, said: bytes, refusal: bytes = b"", status: int = 0) -> None:
-        super().__init__()
-        self.said, self.refusal, self.status = said, refusal, status
-        self.given: dict[str, Any] = {}
-
-    def start_transient(
-        self,
-        unit: str,
-        properties: Sequence[Property],
-        observer: Observer | None,
-        wait: bool,
-        beside: Beside = (),
-    ) -> str:
-        self.given = {name: value for name, _, value in properties}
-        os.write(self.given["StandardOutputFileDescriptor"], self.said)
-        os.write(self.given["StandardErrorFileDescriptor"], self.refusal)
-        self.after_job[unit] = {"ActiveState": "inactive", "Job": (0, "/")}
-        self.after_job[unit] |= {"ExecMainCode": 1, "ExecMainStatus": self.status}
-        return super().start_transient(unit, properties, observer, wait, beside)
-
-
 PROJECT = Project("/srv/x.yml", "alice", "", (("/bin/dora", "build"),), {"A": "b"})
 
 
@@ -189,7 +164,7 @@ def open_files() -> int:
 
 
 def test_the_unit_of_a_build() -> None:
-    manager = Builder(b"one\n", b"failed: x")
+    manager = PrintingManager(b"one\n", refusal=b"failed: x")
     shown: list[str] = []
     before = open_files()
     run = _Runner(shown.append)
@@ -204,14 +179,15 @@ def test_the_unit_of_a_build() -> None:
 
 def test_a_unit_that_cannot_start() -> None:
     with pytest.raises(DoraSystemdError, match=r"cannot build /srv/x\.yml: .*217"):
-        _run_unit(Builder(b"", status=217), PROJECT, ["/bin/python"], _Runner(lambda _: None))
+        manager = PrintingManager(status=217)
+        _run_unit(manager, PROJECT, ["/bin/python"], _Runner(lambda _: None))
 
 
 def test_an_interrupted_unit_is_stopped() -> None:
     def stop(_text: str) -> None:
         raise KeyboardInterrupt
 
-    manager = Builder(b"one\n")
+    manager = PrintingManager(b"one\n")
     with pytest.raises(KeyboardInterrupt):
         _run_unit(manager, PROJECT, ["/bin/python"], _Runner(stop))
     assert manager.calls[-1][0] == "StopUnit"
