@@ -23,7 +23,7 @@ environment:
   LAB=emulator      an emulated machine with Debian's kernel: PSI, cpusets, two processors
   LAB=bookworm      a container with Debian 12: systemd 252, Python 3.11; the checkout is not
                     installed, but all that its packages need is
-  LAB=forky         the same with the next Debian: systemd 262, Python 3.14
+  LAB=forky         a container with Debian forky, as bookworm: systemd 262, Python 3.14
   LAB=rivals        the container with supervisord, circus and pm2, for benchmarks
   LAB=browser       the container with Chromium, for the status page
   LAB=machines      three containers, a b c, on a network with sshd; the command runs in a

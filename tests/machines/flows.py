@@ -16,7 +16,7 @@ PLACE = "/opt/flow"
 NAME = "flow"
 TWO = {"gpu": "b"}
 THREE = {"gpu": "b", "arm": "c"}
-"""The machines beside this one, by their names in the settings."""
+"""The members of the dataflow: name in the settings, and host."""
 GRACE = 2
 _DATAFLOW = """
 nodes:

@@ -143,7 +143,6 @@ def test_restarts_and_stops_that_somebody_asks_for(cell: Cell, project: Project)
     assert shown[1].startswith(f"{cell.name}: Running\n")
     cell.doractl("node", "restart", cell.name, "sink")
     cell.wait_exchanging()
-    sync_journal()
     events = [name for name, node in cell.events() if node == "sink"]
     counts = {"node-asked": 6, "node-crashed": 1, "node-restarted": 1, "node-exited": 5}
     assert {name: events.count(name) for name in counts} == counts

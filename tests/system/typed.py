@@ -36,7 +36,7 @@ QUOTED = re.compile(r"'[^']*'|\"(?:\\.|[^\"\\])*\"|\\.")
 UNSEEN = re.compile(
     r"[^\n]*\r\x1b\[K|\x1b[\[(][0-9;:?]*[a-zA-Z]|\x1b[=>]|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)"
 )
-"""A line that a command has written anew, colours, modes of the terminal, and what it is told."""
+"""Output that a terminal does not show: overwritten lines, colours, and control sequences."""
 
 
 class Typed(NamedTuple):

@@ -2,8 +2,8 @@
 
 The dora command replaces variables when it reads the file. Of a supervised dataflow dora reads the
 descriptor in the unit, which has another environment. So doractl passes the caller's values to the
-runner, which replaces the variables and escapes the result: dora's coordinator and its daemon would
-each replace variables once more (seen with dora 1.1).
+runner. The runner replaces the variables and escapes the result, because dora's coordinator and
+dora's daemon each replace variables again (measured with dora 1.1).
 """
 
 import re
