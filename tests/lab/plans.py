@@ -31,6 +31,8 @@ NO_KERNEL = "not vm and not emulator"
 CONTAINERS = 3
 # What `make test` runs on the next Debian: what differs there.
 NEW = "versions or doctor or units or life or newer or account or ordinary"
+# Far more than any test takes: one that hangs fails and shows where, and the others run.
+PYTEST = ("pytest", "--timeout=900")
 # A dataflow as a service, from start to stop: what to run after every change.
 QUICK = (
     *("cell", "start", "bus", "lab", "stop", "list", "kinds"),
@@ -98,7 +100,7 @@ def unit_step(options: Sequence[str]) -> Step:
     A worker that has no tests left takes over some of another's.
     """
     workers = str((os.cpu_count() or 1) + 1)
-    command = ["python", "-m", "pytest", "tests/unit", "-n", workers, "--dist=worksteal"]
+    command = ["python", "-m", *PYTEST, "tests/unit", "-n", workers, "--dist=worksteal"]
     version = ".".join(map(str, sys.version_info[:2]))
     return Step(f"unit tests, Python {version}", [*command, *options], in_venv, minutes=1)
 
@@ -116,7 +118,7 @@ def plan_other_python(_form: str) -> list[Step]:
 
 
 def plan_lab(_form: str) -> list[Step]:
-    command = ["python", "-m", "pytest", "tests/lab"]
+    command = ["python", "-m", *PYTEST, "tests/lab"]
     return [Step("tests of the lab", command, in_venv, minutes=2)]
 
 
@@ -145,7 +147,7 @@ def reboot_step() -> Step:
     command = ["tests/lab/lab", "run", "--"]
     for place, stage in enumerate(stages):
         command += ["--reboot--"] if place else []
-        command += ["pytest", *(f"tests/boot/test_{name}.py" for name in stage)]
+        command += [*PYTEST, *(f"tests/boot/test_{name}.py" for name in stage)]
     return Step("the packages, a reboot and a power cut, vm", command, in_lab("vm"), minutes=3)
 
 
@@ -185,7 +187,7 @@ def plan_system(form: str) -> list[Step]:
         raise LabError("use LAB=host", "systemd is not running here; LAB=container brings its own")
     if os.geteuid() == 0:
         raise LabError("use LAB=host as root", "its tests run in user scope: be a user, not root")
-    command = ["python", "-m", "pytest", *arguments]
+    command = ["python", "-m", *PYTEST, *arguments]
     return [Step("system tests, this machine", command, partial(in_venv, for_system_tests=True))]
 
 
@@ -296,7 +298,7 @@ def queue_steps(
     return [
         Step(
             f"{name}, {what} {number} of {count}",
-            [*run, "pytest", f"--queue={place}", *arguments],
+            [*run, *PYTEST, f"--queue={place}", *arguments],
             env.copy,
             minutes=minutes,
             after=tuple(one.name for one in packages_for(form)),
@@ -306,7 +308,7 @@ def queue_steps(
 
 
 def lab_step(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> Step:
-    command = ["tests/lab/lab", "run", "--", "pytest", *arguments]
+    command = ["tests/lab/lab", "run", "--", *PYTEST, *arguments]
     return Step(name, command, in_lab(form), minutes=minutes)
 
 
