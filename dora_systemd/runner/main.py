@@ -257,7 +257,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
 
             wait_for_needs(run, own, reloader.definition, dialogue.spawn)
         dialogue.spawn("end with the last node", end_held(run))
-        dialogue.spawn("tell that it has started", tell_started(run, reloader.has_started))
+        dialogue.spawn("report that it has started", tell_started(run, reloader.has_started))
         if prepared.plan.options.owes:
             from dora_systemd.runner.owes.watch import watch_owes
 

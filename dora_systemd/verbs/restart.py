@@ -90,7 +90,7 @@ def _outcome(manager: Manager, scope: Scope, cell: Cell, result: str, was_frozen
     if result == "dependency":
         needed = manager.read(cell.unit, ["Requires"])["Requires"] or ()
         reason, more = need_failure(manager, scope.flag, needed)
-        hint = f"{more} tells more"
+        hint = f"{more} shows more"
     elif refusal := runners_refusal(manager, cell.unit):
         return Outcome.of_error(cell, refusal)
     else:

@@ -29,7 +29,7 @@ WITH_ROBOT = tuple(
 )
 """Pages about a robot that is already in PLACE."""
 PLACE, ARM = Path("/srv/robot"), Path("/srv/arm")
-LEFT = "/srv/records /etc/systemd/system/tell.service"
+LEFT = "/srv/records /etc/systemd/system/notify.service"
 """What pages make elsewhere."""
 EXAMPLES = Path("/usr/share/doc/dora-systemd/examples")
 

@@ -394,7 +394,7 @@ def test_which_file_is_meant(dora: Dora, cell: Cell, places: Sequence[Project]) 
     twin.rename(hidden)
     (place.root / "dataflow.yml").unlink()
     error = dora.refusal("start", str(hidden), "--detach")
-    assert "cannot tell which file" in error
+    assert "cannot find out which file" in error
     assert "doractl start FILE" in error
 
 

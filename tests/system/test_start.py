@@ -224,7 +224,7 @@ def test_a_failed_start_says_why(cell: Cell, project: Project) -> None:
     assert message == f"doractl: cannot start {cell.name}: node one: exit code 1"
     flag = cell.scope.flag
     check = f"check logs: doractl {flag} logs {cell.name} --node one"
-    assert hint == f"hint: {check}; doractl {flag} why {cell.name} tells more"
+    assert hint == f"hint: {check}; doractl {flag} why {cell.name} shows more"
 
 
 # As above.

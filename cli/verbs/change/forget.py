@@ -14,7 +14,7 @@ from dora_systemd.verbs.releases.forget import Kept, find_kept, forget, remove_r
 @click.command("forget")
 @click.argument("selector")
 @click.argument("releases", nargs=-1, metavar="[RELEASE]...")
-@click.option("--force", is_flag=True, help="Do not ask; needed without a terminal.")
+@click.option("--force", is_flag=True, help="Do not prompt; required without a terminal.")
 @acting_options
 def command(selector: str, releases: tuple[str, ...], force: bool) -> int:
     """Remove all that is kept of a dataflow: its releases, their history, its place in list --all.

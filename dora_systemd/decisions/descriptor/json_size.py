@@ -25,7 +25,7 @@ def check_json(document: object, source: str, max_bytes: int) -> None:
         value, depth = waiting.pop()
         size += _size(value, source)
         if size > max_bytes:
-            hint = f"{max_bytes // 1024} KiB is the most; look for anchors that repeat much"
+            hint = f"{max_bytes // 1024} KiB is the maximum; check for anchors that repeat a lot"
             raise refusal(source, "it is too large once its anchors are written out", hint)
         if depth > MAX_DEPTH:
             raise refusal(source, f"it is nested more than {MAX_DEPTH} levels deep", "flatten it")

@@ -80,6 +80,6 @@ WATCHDOG = Setting[Watchdogs](
     per_node=True,
 )
 NOTIFY = Setting[bool](
-    "notify", BOOL, False, "Give the nodes a notify socket, to tell their STATUS=.", per_node=True
+    "notify", BOOL, False, "Give the nodes a notify socket, to report their STATUS=.", per_node=True
 )
 SIGN_SETTINGS: tuple[Setting[Any], ...] = (WATCHDOG, NOTIFY)

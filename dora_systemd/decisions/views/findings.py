@@ -92,7 +92,7 @@ def judge_journal(place: Place, storage: str) -> Finding:
     Files alone prove nothing: those of an earlier Storage= stay where they are.
     """
     if place is Place.UNKNOWN:
-        text = "without the system's systemd nobody can tell whether it survives a reboot"
+        text = "whether it survives a reboot is not known without the system's systemd"
         return Finding(_JOURNAL, State.NOTE, text)
     if place is Place.STOPPED:
         text = "systemd-journald does not run: no line is kept"
@@ -115,7 +115,7 @@ def _kept_nowhere(storage: str) -> Finding:
         text = "no line is kept: journald has Storage=none"
         return Finding(_JOURNAL, State.WARNING, text, _KEEP)
     text = "systemd-journald has kept no line since it was started"
-    remedy = "as root: systemctl restart systemd-journald; its systemctl status tells of errors"
+    remedy = "as root: systemctl restart systemd-journald; its systemctl status shows errors"
     return Finding(_JOURNAL, State.WARNING, text, remedy)
 
 

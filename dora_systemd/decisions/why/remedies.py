@@ -22,7 +22,7 @@ _REMEDIES = {
     "Python), or raise watchdog: in its settings",
     Cause.NODE_SILENT: "find out why {node} sends nothing, or give it more time: "
     "owes: in the settings file",
-    Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or run: "
+    Cause.NODE_OUT_OF_MEMORY: "find the leak in {node}, or run: "
     "doractl set {name} --node-limit {node}:memory=SIZE",
     Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",
     Cause.REFUSED: "fix {file}, then run: doractl restart {name}",
@@ -52,7 +52,7 @@ _MEMORY_REMEDIES = {
 }
 """Remedies by the owner of the exceeded memory limit, unless that is the node."""
 _SIGNAL_REMEDIES: Mapping[int, str] = {
-    signal.SIGKILL: "find out who killed {node}: journalctl -k, or somebody's kill -9",
+    signal.SIGKILL: "find out who killed {node}: journalctl -k, or a kill -9 by hand",
     **dict.fromkeys(
         (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGILL, signal.SIGFPE),
         "fix {node}; coredumpctl info {pid} shows where it crashed",

@@ -33,7 +33,7 @@ _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 
 _GIVEN_UP = "systemd has stopped restarting it; doractl restart {name} resets the counter"
 _WAITING = "systemd restarts it automatically; doractl stop {name} prevents that"
-_THERE = "doractl -H {host} why {name} tells what machine {machine} has seen"
+_THERE = "doractl -H {host} why {name} shows what machine {machine} has seen"
 _AGAIN = "nothing: dora restarts {node} automatically"
 _AGAIN_FIXED = "dora restarts {node} automatically, and so finds it fixed"
 _HOPELESS = re.compile(r"(SyntaxError|IndentationError|TabError|ModuleNotFoundError|ImportError)\b")

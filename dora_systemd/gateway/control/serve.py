@@ -38,7 +38,7 @@ _AT_ONCE = 8
 """Requests of one connection that run in parallel."""
 _LONGEST = 500
 _BY_FILE = "edit its file, then run: doractl reload NAME"
-_OWN = "doractl dora NAME -- trace list asks the coordinator of one dataflow"
+_OWN = "doractl dora NAME -- trace list sends the request to the coordinator of one dataflow"
 
 
 async def serve_control(socket: Socket, request: HttpRequest) -> None:

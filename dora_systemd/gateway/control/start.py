@@ -83,7 +83,7 @@ def find_file(directory: Path, session: str) -> Path:
         return found[0]
     names = ", ".join(path.name for path in found)
     raise _no_file(
-        "cannot tell which file this dataflow is from: "
+        "cannot find out which file this dataflow is from: "
         + (f"{names} have one session" if found else f"no file in {directory} has its session")
     )
 
@@ -96,7 +96,7 @@ def _files(directory: Path) -> list[Path]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not a path"
         raise _no_file(
-            f"cannot look for the dataflow in {shown(str(directory))}: {reason}"
+            f"cannot search for the dataflow in {shown(str(directory))}: {reason}"
         ) from error
     return [directory / name for name in names if name.endswith(_SUFFIXES)][:_MOST_FILES]
 

@@ -101,7 +101,7 @@ def ended_result(scope: Scope, uuid: str) -> dict[str, Any]:
 def _account(report: Report) -> str:
     lines = [report.verdict.summary, *(word.text for word in report.words)]
     return "\n".join(
-        [*lines, f"doractl {report.subject.flag} why {report.subject.name} tells more"]
+        [*lines, f"doractl {report.subject.flag} why {report.subject.name} shows more"]
     )
 
 

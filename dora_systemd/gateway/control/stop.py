@@ -55,7 +55,7 @@ async def restart(talk: Talk, request: Request) -> dict[str, Any]:
         await asyncio.to_thread(require_startable, scope, cell)
         outcome = await _within(scope, cell, request, lambda: _restart(scope, cell))
     if outcome.problem:
-        hint = outcome.hint or f"doractl {scope.flag} why {cell.name} tells more"
+        hint = outcome.hint or f"doractl {scope.flag} why {cell.name} shows more"
         raise DoraSystemdError(outcome.problem, hint)
     return {"DataflowRestarted": {"old_uuid": cell.uuid, "new_uuid": cell.uuid}}
 

@@ -24,7 +24,7 @@ const limitWords = (facts) => [
 const inhibitorWords = ({ node, pid, user, why }) =>
   `${node ? `node ${node}` : `PID ${pid ?? "unknown"}, user ${user ?? "unknown"}`}${why ? `: ${why}` : ""}`;
 
-/** The last release that has failed its trial, as far as the journal tells of this life. */
+/** The last release that has failed its trial, as far as the journal has it for this life. */
 function undoneWords(why) {
   const last = why?.timeline.findLast(({ event }) => event === "release-rolled-back");
   return last ? `${last.text}, ${since(last.at_us)}` : "";

@@ -107,7 +107,7 @@ class Dialogue(Tasks):
         event = life.ChildExited(
             now_us(), label, exit if oom is None else Exit(words=oom.text), oom
         )
-        self.spawn(f"tell that the {label} has exited", self._push_after_signals(event))
+        self.spawn(f"report that the {label} has exited", self._push_after_signals(event))
 
     async def _push_after_signals(self, event: life.Event) -> None:
         for _ in range(_TURNS):

@@ -105,13 +105,13 @@ class Pump:
     def _take(self, event: life.Event) -> None:
         before = self.cell
         if before.state is not State.ENDED:  # else one that always raises would do so for ever
-            with self._guard("tell other machines"):
+            with self._guard("notify other machines"):
                 self.on_event(event)
         actions = self._step(event)
         if self.cell is not before:
             with self._guard("show its state"):
                 self._publish()
-            with self._guard("tell its state to its own tasks"):
+            with self._guard("notify its own tasks"):
                 self._tell_waiting()
         for action in actions:
             with self._guard(_name(action)):

@@ -63,7 +63,7 @@ def find_spent(options: RunnerOptions, paths: CellPaths) -> RestartsSpent | None
         return None
     most, window = policy.max_restarts, format_duration(policy.window)
     count = "1 automatic restart" if most == 1 else f"{most} automatic restarts"
-    hint = f"doractl why {options.name} tells what has failed"
+    hint = f"doractl why {options.name} shows what has failed"
     return RestartsSpent(f"{count} within {window} did not help", hint)
 
 

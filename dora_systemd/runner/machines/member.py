@@ -159,8 +159,8 @@ class Member(Shared):
         pump.on_event = self._tell_hung
         dialogue = MemberDialogue(options, pump, dora, nodes, pipes, self)
         self._spawn = dialogue.spawn
-        dialogue.spawn("hear the head", self._hear_head())
-        dialogue.spawn("tell what its nodes run", self._tell_programs())
+        dialogue.spawn("receive from the head", self._hear_head())
+        dialogue.spawn("report what its nodes run", self._tell_programs())
         return dialogue
 
     def _note_table(self, uses: Uses, table: CellStatus) -> CellStatus:

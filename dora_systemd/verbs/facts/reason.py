@@ -32,7 +32,7 @@ def logs_hint(flag: str, name: str, reason: str) -> str:
 
     flag: of the scope. reason: of job_reason().
     """
-    more = f"doractl {flag} why {name} tells more"
+    more = f"doractl {flag} why {name} shows more"
     found = _NODE.match(reason)
     if not found:
         return more

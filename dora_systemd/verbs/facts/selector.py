@@ -79,7 +79,7 @@ class Selector:
         found = self.meant(known)
         if len(found) > 1:
             candidates = ", ".join(f"{one.uuid} ({one.name})" for one in found[:_SHOWN])
-            message = f"cannot tell which dataflow {quoted(self.text)} is"
+            message = f"{quoted(self.text)} is ambiguous"
             raise DoraSystemdError(message, f"one of {candidates}", ExitCode.USAGE)
         return found[0] if found else None
 

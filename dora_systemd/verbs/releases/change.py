@@ -203,7 +203,7 @@ def _roll_back(attempt: _Attempt, fault: Fault, mark: _Mark) -> DoraSystemdError
     note_request(ROLLED_BACK, name, uuid, change.by, **details, **reasons)
     return DoraSystemdError(
         f"release {change.release} of {name} was rolled back: {fault.reason}",
-        f"{now}; {known_remedy(fault.lines) or f'doractl why {name} tells more'}",
+        f"{now}; {known_remedy(fault.lines) or f'doractl why {name} shows more'}",
         ExitCode.ROLLED_BACK,
         fault.lines,
     )

@@ -115,7 +115,7 @@ def _ends_quietly(name: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as error:
-        hint = f"doractl releases {name} tells which release runs"
+        hint = f"doractl releases {name} shows which release runs"
         message = "the deploy was interrupted"
         raise DoraSystemdError(message, hint, ExitCode.INTERRUPTED) from error
     finally:

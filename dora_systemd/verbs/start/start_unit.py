@@ -79,7 +79,7 @@ def start_unit(
         raise refusal
     if result == "dependency":
         reason, more = need_failure(manager, scope.flag, needed)
-        raise DoraSystemdError(f"cannot start {options.name}: {reason}", f"{more} tells more")
+        raise DoraSystemdError(f"cannot start {options.name}: {reason}", f"{more} shows more")
     if has_failed and wait:
         result = "failed" if result == JOB_DONE else result
         raise _start_failure(manager, scope, unit, options.name, result)

@@ -64,7 +64,7 @@ def test_a_unit_that_is_needed_and_fails_is_named(cell: Cell, project: Project) 
     finally:
         run("systemctl", flag, "reset-failed", unit, check=False)
     assert f"cannot start {cell.name}: {unit}, which it needs, failed" in done.stderr
-    assert f"hint: systemctl {flag} status {unit} tells more" in done.stderr
+    assert f"hint: systemctl {flag} status {unit} shows more" in done.stderr
 
 
 def test_a_dataflow_stops_with_a_unit_whose_name_is_escaped(cell: Cell, project: Project) -> None:

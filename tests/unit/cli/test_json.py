@@ -96,7 +96,7 @@ def test_an_outcome_with_a_problem(manager: FakeManager, capsys: Printed) -> Non
     assert (outcome["action"], outcome["result"], outcome["text"]) == ("restart", "failed", None)
     assert outcome["error"] == {
         "message": "cannot restart robot: it was stopped while it started",
-        "hint": "doractl --system why robot tells more",
+        "hint": "doractl --system why robot shows more",
         "exit_status": 1,
         "lines": [],
     }

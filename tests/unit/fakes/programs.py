@@ -12,7 +12,7 @@ def make_program(path: Path, text: str = "") -> str:
 
 
 def make_dora(path: Path, version: str) -> str:
-    """A dora that has a version and validates, and notes in PATH.asked what it is asked."""
+    """A dora that has a version and validates, and records in PATH.asked what it is asked."""
     return make_program(
         path,
         f"""echo "$1" >> "$0.asked"

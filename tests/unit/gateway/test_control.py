@@ -282,7 +282,7 @@ def test_a_program_that_is_in_no_file(command: str, path: str, args: str) -> Non
 
 @pytest.mark.parametrize("directory", ["/nowhere", "nowhere"])
 def test_a_directory_that_is_none(directory: str) -> None:
-    with pytest.raises(DoraSystemdError, match=r"^cannot (look for the dataflow|start) in"):
+    with pytest.raises(DoraSystemdError, match=r"^cannot (search for the dataflow|start) in"):
         find_file(Path(directory), "one")
 
 
@@ -320,7 +320,7 @@ def test_a_session_that_names_no_file(
     for name in files:
         (tmp_path / name).write_text("nodes: []\n")
     keep_session(tmp_path, "flow", session)
-    expected = f"^cannot tell which file this dataflow is from: {reason}$"
+    expected = f"^cannot find out which file this dataflow is from: {reason}$"
     with pytest.raises(DoraSystemdError, match=expected) as caught:
         find_file(tmp_path, "one")
     assert caught.value.hint == "doractl start FILE takes the file itself"

@@ -115,7 +115,7 @@ def test_a_restart_that_fails_is_told_with_where_to_look(bench: Bench) -> None:
         bench.act("restart")
     flag = bench.scope.flag
     check = f"check logs: doractl {flag} logs robot --node a"
-    assert caught.value.hint == f"{check}; doractl {flag} why robot tells more"
+    assert caught.value.hint == f"{check}; doractl {flag} why robot shows more"
 
 
 def test_the_page_names_a_dataflow_that_is_gone(bench: Bench) -> None:
@@ -251,7 +251,7 @@ def test_dora_starts_the_file_of_its_session(bench: Bench, tmp_path: Path) -> No
     wanted = wanted_start(Request("x", "Start", {**body, "name": "robot", "uv": True}))
     assert (wanted.dataflow, wanted.name) == (str(tmp_path / "flow.yml"), "robot")
     assert wanted.flags == {"env": ("A=b",), "uv": True}
-    with pytest.raises(DoraSystemdError, match="cannot tell which file this dataflow is from"):
+    with pytest.raises(DoraSystemdError, match="cannot find out which file this dataflow is from"):
         bench.ask("Start", **body | {"session_id": "two"})
     assert not bench.manager.calls
 
@@ -356,7 +356,7 @@ def test_a_dora_restart_that_fails(bench: Bench) -> None:
     bench.manager.units[UNIT] |= {"StatusText": "failed: x"}
     with pytest.raises(DoraSystemdError, match="cannot restart") as caught:
         bench.ask("RestartByName", name="robot")
-    assert caught.value.hint == "doractl --user why robot tells more"
+    assert caught.value.hint == "doractl --user why robot shows more"
 
 
 def _run(bench: Bench, run: str) -> None:

@@ -16,6 +16,7 @@ SMELLS = (
     *("who asks", "who wants", "there are no,", "there are {", "is no end", "is no error"),
     *("stays away", "others run on", "runs on without", "goes on starting", "takes it back"),
     *("cannot go on", "so much at once", "nobody is there", "gets short", "root's word"),
+    *("tells more", "tells what", "tells which", "tells of", "to tell", "cannot tell", "look for"),
 )
 RIDDLES = (
     # In comments and docstrings: report, notify, send, receive, request, read, record.

@@ -50,7 +50,7 @@ def test_restart_that_fails(manager: FakeManager) -> None:
     manager.job_results[UNIT] = "failed"
     (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
     assert outcome.problem == "cannot restart robot: node camera failed (exit code 1)"
-    assert outcome.hint == "doractl --user why robot tells more"
+    assert outcome.hint == "doractl --user why robot shows more"
 
 
 def test_the_node_that_failed_has_its_logs_named(manager: FakeManager) -> None:
@@ -59,7 +59,7 @@ def test_the_node_that_failed_has_its_logs_named(manager: FakeManager) -> None:
     manager.job_results[UNIT] = "failed"
     (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
     assert outcome.problem == f"cannot restart robot: {reason}"
-    more = "doractl --user why robot tells more"
+    more = "doractl --user why robot shows more"
     assert outcome.hint == f"check logs: doractl --user logs robot --node camera; {more}"
 
 
@@ -82,7 +82,7 @@ def test_restart_without_what_it_needs(manager: FakeManager) -> None:
     robot = [one for one in read_cells(manager) if one.name == "robot"]
     (outcome,) = restart_cells(manager, SCOPE, robot, BY, ask=accept)
     assert outcome.problem == "cannot restart robot: dataflow base, which it needs, failed"
-    assert outcome.hint == "doractl --user why base tells more"
+    assert outcome.hint == "doractl --user why base shows more"
 
 
 def test_what_could_not_start_again_keeps_running(manager: FakeManager) -> None:

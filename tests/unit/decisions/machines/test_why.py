@@ -43,7 +43,7 @@ def test_it_waits_for_a_machine_that_it_had() -> None:
     assert f"  Now:      {WAITS}\n" in text
     assert "  Machines: head, gpu (alice@gpu-box), npu\n" in text
     assert "nothing: it starts when all machines are there; doractl stop robot gives up" in text
-    assert "doractl -H alice@gpu-box why robot tells what machine gpu has seen" in text
+    assert "doractl -H alice@gpu-box why robot shows what machine gpu has seen" in text
 
 
 def test_it_waits_for_a_machine_that_never_came() -> None:

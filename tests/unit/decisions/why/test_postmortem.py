@@ -445,7 +445,7 @@ def test_what_to_do_is_whole_at_any_width(width: int) -> None:
     assert not [line for line in lines if len(line) > width and subject.name not in line]
     assert lines[0].endswith(": Failed")
     whole = " ".join(text.partition("What to do:")[2].split())
-    assert "look for a leak in camera, or run: doractl set" in whole
+    assert "find the leak in camera, or run: doractl set" in whole
     assert "--node-limit camera:memory=SIZE" in whole
     assert UUID in text
 

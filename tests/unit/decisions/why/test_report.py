@@ -100,7 +100,7 @@ The last 2 lines of camera (all: doractl logs robot --node camera):
   13:00:05  ... the same line, 3 times in all
 
 What to do:
-  look for a leak in camera, or run: doractl set robot --node-limit camera:memory=SIZE"""
+  find the leak in camera, or run: doractl set robot --node-limit camera:memory=SIZE"""
     )
 
 
@@ -314,7 +314,7 @@ AWAY = "camera stays down until doractl restart robot; the other nodes keep runn
             replace(OF_MACHINE, policy="always"),
             [
                 "run: doractl restart robot",
-                "doractl -H alice@gpu-box why robot tells what machine gpu has seen",
+                "doractl -H alice@gpu-box why robot shows what machine gpu has seen",
             ],
         ),
         (

@@ -461,11 +461,11 @@ MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (--
         ),
         (
             Verdict("Failed", Cause.NODE_OUT_OF_MEMORY, details={"owner": "node"}),
-            "look for a leak in {node}, or run: doractl set {name} --node-limit {node}:memory=SIZE",
+            "find the leak in {node}, or run: doractl set {name} --node-limit {node}:memory=SIZE",
         ),
         (
             Verdict("Failed", Cause.NODE_FAILED, details={"exit": "signal SIGKILL"}),
-            "find out who killed {node}: journalctl -k, or somebody's kill -9",
+            "find out who killed {node}: journalctl -k, or a kill -9 by hand",
         ),
         (
             Verdict("Failed", Cause.NODE_FAILED, details={"exit": "signal SIGUSR1"}),

@@ -37,7 +37,7 @@ def spoil_record(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("spoil", "step"),
     [
-        (spoil_event, "tell other machines"),
+        (spoil_event, "notify other machines"),
         (spoil_table, "show its state"),
         (spoil_record, "write the event node-crashed"),
     ],
@@ -66,7 +66,7 @@ def test_a_condition_that_raises_is_named(tmp_path: Path) -> None:
         await asyncio.sleep(0)
         bench.push(life.ReloadNoted(1, "x"))
         wait.cancel()
-        failure = "the runner could not tell its state to its own tasks: "
+        failure = "the runner could not notify its own tasks: "
         assert bench.pump.cell.failure == f"{failure}BlockingIOError: [Errno 11] busy"
 
     live(work)

@@ -95,7 +95,7 @@ def test_a_release_that_fails_stays_to_be_looked_at(bench: Bench) -> None:
     (latest,) = {*bench.releases} - {first.release}
     assert error.code is ExitCode.ROLLED_BACK
     assert error.message.startswith(f"release {latest} of robot was rolled back: ")
-    assert error.hint == f"{first.release} runs again; doractl why robot tells more"
+    assert error.hint == f"{first.release} runs again; doractl why robot shows more"
     assert bench.releases == {first.release: "current", latest: "failed"}
     assert bench.manager.units[UNIT]["ActiveState"] == "active"
     standing = read_standing(bench.manager, bench.scope, UNIT)
@@ -106,7 +106,7 @@ def test_a_release_that_fails_stays_to_be_looked_at(bench: Bench) -> None:
 
 def test_a_first_release_that_fails_leaves_nothing_running(bench: Bench) -> None:
     bench.manager.state = "failed"
-    assert refused(bench).hint == "nothing of it runs; doractl why robot tells more"
+    assert refused(bench).hint == "nothing of it runs; doractl why robot shows more"
     assert ("StopUnit", UNIT) in bench.manager.calls
     assert [*bench.releases.values()] == ["failed"]
     bench.manager.state = "active"

@@ -84,7 +84,7 @@ def test_a_way_back(manager: FakeManager, scope: Scope, store: Store, notes: Not
     fault = Fault("node a: exit code 1", "a", lines=("a: one", "a: two"))
     error = refusal(lambda: try_new(manager, scope, store, fault))
     assert error.message == f"release {NEW} of robot was rolled back: node a: exit code 1"
-    assert error.hint == f"{OLD} runs again; doractl why robot tells more"
+    assert error.hint == f"{OLD} runs again; doractl why robot shows more"
     assert error.lines == ("a: one", "a: two")
     rolled_back = ("release-rolled-back", NEW, OLD, "a", "node a: exit code 1")
     # The first stop is that of the former release, the second one that of the release on trial.
@@ -102,7 +102,7 @@ def test_a_trial_that_somebody_stops(
     deployed(manager)
     fault = Fault("it was stopped", is_stop=True)
     error = refusal(lambda: try_new(manager, scope, store, fault))
-    assert error.hint == "nothing of it runs; doractl why robot tells more"
+    assert error.hint == "nothing of it runs; doractl why robot shows more"
     assert [one for (one,) in notes.found("DORA_EVENT")] == ["stop-asked", "release-rolled-back"]
 
 
