@@ -248,6 +248,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         runs.pipes.mute()
         listen(runs, pump, dialogue)
         if coordinator is not None:
+            dora.wait_boot()
             dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)

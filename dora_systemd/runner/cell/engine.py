@@ -72,6 +72,14 @@ class Engine:
         self._children[child.label] = child
         return child
 
+    def wait_boot(self) -> None:
+        """Wait until the thread of the boot reads the coordinator's output no more.
+
+        Two readers would take lines from each other, and the port would be lost.
+        """
+        if self._boot:
+            self._boot.daemon()
+
     def set_port(self, port: int) -> None:
         """Set the port of the coordinator, which has written its token by now. Raises OSError."""
         self._port, self._token = port, read_token(self._paths)

@@ -7,12 +7,14 @@ import signal
 import stat
 from collections.abc import Callable, Coroutine
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
 from dora_systemd.adapters.dora import engine
+from dora_systemd.adapters.host.process import beside
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora.protocol import LogRecord
@@ -108,14 +110,14 @@ exec sleep 1000
 """
 
 
-def booting(bench: Bench, script: str = BOOTS) -> Boot:
+def booting(bench: Bench, script: str = BOOTS, kind: type[Boot] = Boot) -> Boot:
     """A dora that boots before there is an engine, which is told of it."""
     dora = bench.paths.root / "dora"
     make_program(dora, script)
     environment = {"PATH": "/usr/bin:/bin"}
     coordinator = start_coordinator(str(dora), bench.paths, environment)
     options = RunnerOptions("robot", "uuid", "/p/d.yml", "/p", str(dora))
-    boot = Boot(coordinator, options, bench.paths, bench.paths.root, environment)
+    boot = kind(coordinator, options, bench.paths, bench.paths.root, environment)
     bench.engine = Engine(str(dora), bench.paths, environment, boot)
     bench.children.append(coordinator)
     return boot
@@ -166,6 +168,33 @@ def test_a_boot_that_fails_leaves_the_daemon_to_the_engine(tmp_path: Path, scrip
         assert boot.listens() == ("Listening" in script)
         assert bench.engine.start_coordinator() is boot.coordinator
         assert boot.coordinator.said
+
+    live(tmp_path, work)
+
+
+class HeldBoot(Boot):
+    """A boot that reads the output of the coordinator until it may end."""
+
+    may_end = Event()
+    has_read = False
+
+    def _find_port(self) -> int:
+        self.may_end.wait()
+        self.has_read = True
+        return 0
+
+
+def test_two_threads_never_read_the_coordinator(tmp_path: Path) -> None:
+    """Each would take lines from the other, and the port was lost."""
+
+    async def work(bench: Bench) -> None:
+        boot = booting(bench, kind=HeldBoot)
+        assert bench.engine.start_coordinator() is boot.coordinator
+        waiting = beside(bench.engine.wait_boot)
+        assert not waiting.done()
+        HeldBoot.may_end.set()
+        waiting.result(20)
+        assert isinstance(boot, HeldBoot) and boot.has_read
 
     live(tmp_path, work)
 
