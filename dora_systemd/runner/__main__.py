@@ -58,19 +58,18 @@ def begin_shared(
     options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
 ) -> "Begun":
     """Start dora as begin() does, on one of several machines. Raises OSError, DoraSystemdError."""
+    boot: EarlyDaemon
     if options.machine:
         from dora_systemd.runner.machines.boot import MemberBoot
 
-        of_member = MemberBoot(options, paths, unit, environment)
-        from dora_systemd.adapters.dora.check import DoraCheck
+        boot = MemberBoot(options, paths, unit, environment)
+    else:
+        from dora_systemd.runner.machines.boot import HeadBoot
 
-        return of_member, DoraCheck(options, environment)
-    from dora_systemd.runner.machines.boot import HeadBoot
-
-    of_head = HeadBoot(options, paths, unit, environment)
+        boot = HeadBoot(options, paths, unit, environment)
     from dora_systemd.adapters.dora.check import DoraCheck
 
-    return of_head, DoraCheck(options, environment, of_head.listens)
+    return boot, DoraCheck(options, environment)  # machines compare the versions of their dora
 
 
 def main(argv: list[str]) -> int:

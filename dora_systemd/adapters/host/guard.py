@@ -5,6 +5,10 @@ the end of a connection, which the kernel closes. The child holds the lock of it
 flock(2), so no other process takes the lock before the work is finished. The child has its own
 session, and ignores all signals that can be ignored: only SIGKILL to the whole cgroup ends parent
 and child, and then the next command has to finish the work.
+
+A transient unit with ExecStopPost= cannot replace it. Such a unit cannot hold the lock: another
+command could change the same files first. The work would need a Python of its own, which takes 0.2
+to 0.3 s to load it, and its arguments in the text of the unit, which all users can read.
 """
 
 import os
