@@ -1,8 +1,9 @@
 """Waits for what nodes need: tasks of a run, only if a node has needs.
 
 A thread checks the paths, because a file system may hang. The thread checks them when a parent
-directory of a path changes, and every _LOOK_SECONDS: not all file systems report changes. The
-decisions are in decisions/needs/steps.py, the gates in runner/nodes/launcher_gates.py.
+directory of a path or a network interface changes, and every _LOOK_SECONDS: not all file systems
+report changes, nor do all CAN drivers. The decisions are in decisions/needs/steps.py, the gates in
+runner/nodes/launcher_gates.py.
 """
 
 import asyncio
@@ -12,8 +13,9 @@ from typing import Any
 
 from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.host.inotify import Inotify
+from dora_systemd.adapters.host.links import LinkChanges, look_at_link
 from dora_systemd.adapters.host.presence import Presence, look_at, watched_places
-from dora_systemd.decisions.cell.needs import paths_by_node
+from dora_systemd.decisions.cell.needs import NET, needs_by_node
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import LATCHED
 from dora_systemd.decisions.life import events as life
@@ -26,22 +28,30 @@ from dora_systemd.values import INFINITY, SECOND
 
 
 class Watch:
-    """Directories that are watched by inotify(7). Close it.
+    """Directories that are watched by inotify(7), and network interfaces. Close it.
 
-    Where the kernel has no inotify instance left, wait() waits for its whole time.
+    Where the kernel has no inotify instance left, or the sandbox no AF_NETLINK, wait() waits for
+    its whole time.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, has_links: bool = False) -> None:
         self._loop = asyncio.get_running_loop()
         self._event = asyncio.Event()
         self._inotify: Inotify | None = None
+        self._sources: list[Inotify | LinkChanges] = []
         with contextlib.suppress(OSError):
             self._inotify = Inotify()
-            self._loop.add_reader(self._inotify.fd, self._read)
+            self._add(self._inotify)
+        if has_links:
+            with contextlib.suppress(OSError):
+                self._add(LinkChanges())
 
-    def _read(self) -> None:
-        assert self._inotify is not None
-        self._inotify.drain()
+    def _add(self, source: Inotify | LinkChanges) -> None:
+        self._sources.append(source)
+        self._loop.add_reader(source.fd, self._read, source)
+
+    def _read(self, source: Inotify | LinkChanges) -> None:
+        source.drain()
         self._event.set()
 
     def set_places(self, directories: Iterable[str]) -> None:
@@ -65,10 +75,15 @@ class Watch:
 
     def close(self) -> None:
         """Stop watching."""
-        if self._inotify is not None:
-            self._loop.remove_reader(self._inotify.fd)
-            self._inotify.close()
-            self._inotify = None
+        for source in self._sources:
+            self._loop.remove_reader(source.fd)
+            source.close()
+        self._sources, self._inotify = [], None
+
+
+def check(what: str) -> Presence:
+    """Check what a node needs: a path, or net:INTERFACE."""
+    return look_at_link(what.removeprefix(NET)) if what.startswith(NET) else look_at(what)
 
 
 _LOOK_SECONDS = 2.0
@@ -98,13 +113,15 @@ class Needs:
         self, run: Run, options: RunnerOptions, definition: Definition, spawn: Spawn
     ) -> None:
         self._run, self._definition, self._spawn = run, definition, spawn
-        self._paths = paths_by_node(options.needs)
+        self._needs = needs_by_node(options.needs)
         self._start_timeout = options.start_timeout
         self._passed: dict[str, list[Presence]] = {}
         self._losing: set[str] = set()
         self._closed: set[str] = set()
 
-        self._watch = Watch()
+        every = {one.what for one in options.needs}
+        self._paths = {one for one in every if not one.startswith(NET)}
+        self._watch = Watch(has_links=every != self._paths)
 
     async def latch(self) -> None:
         """Close the gate of a node without restarts that has failed, until it is clear why."""
@@ -116,7 +133,7 @@ class Needs:
             self._watch.wake()
 
     def _latched(self, cell: Cell) -> set[str]:
-        nodes = ((node, cell.nodes[node]) for node in self._paths.keys() & cell.nodes.keys())
+        nodes = ((node, cell.nodes[node]) for node in self._needs.keys() & cell.nodes.keys())
         down = {node for node, one in nodes if one.policy == LATCHED and one.state == "failed"}
         return down - self._closed
 
@@ -131,8 +148,8 @@ class Needs:
 
     def _look(self) -> dict[str, list[Presence]]:
         # Watch first: what changes after the look is not missed then.
-        self._watch.set_places(watched_places(one for many in self._paths.values() for one in many))
-        return {node: [look_at(path) for path in paths] for node, paths in self._paths.items()}
+        self._watch.set_places(watched_places(self._paths))
+        return {node: [*map(check, needs)] for node, needs in self._needs.items()}
 
     def _act(self, found: Mapping[str, list[Presence]]) -> None:
         cell = self._run.pump.cell
@@ -147,12 +164,12 @@ class Needs:
                 self._take(step, found[step.node])
 
     def _missing(self, node: str, seen: list[Presence]) -> str:
-        pairs = zip(self._paths[node], seen, strict=True)
-        reasons = [f"{path} ({one.reason})" for path, one in pairs if one.reason]
+        pairs = zip(self._needs[node], seen, strict=True)
+        reasons = [f"{what} ({one.reason})" for what, one in pairs if one.reason]
         before = self._passed.get(node, seen)
         if not reasons and before != seen:
-            changed = zip(self._paths[node], seen, before, strict=True)
-            reasons = [f"{path} ({_AGAIN})" for path, one, old in changed if one != old]
+            changed = zip(self._needs[node], seen, before, strict=True)
+            reasons = [f"{what} ({_AGAIN})" for what, one, old in changed if one != old]
         return ", ".join(reasons)
 
     def _take(self, step: NeedStep, seen: list[Presence]) -> None:

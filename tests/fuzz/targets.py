@@ -48,6 +48,7 @@ from dora_systemd.decisions.logs.lines import (
 from dora_systemd.decisions.logs.records import parse_filter
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.description import Facts, parse_facts, problems, summary
+from dora_systemd.decisions.needs.links import link_problem, parse_link
 from dora_systemd.decisions.properties.assignments import parse_property
 from dora_systemd.decisions.releases.parcel import (
     format_parcel,
@@ -182,6 +183,11 @@ def _of_text(*readers: Callable[[str], object]) -> Callable[[bytes], None]:
     return read
 
 
+def _link(data: bytes) -> None:
+    link = parse_link(data, 1)
+    assert link is None or link_problem(link) in ("", "down", "bus-off", "no carrier")
+
+
 def _parcel(data: bytes) -> None:
     parcel = parse_parcel(data)
     assert parse_parcel(format_parcel(parcel)) == parcel
@@ -225,6 +231,7 @@ TARGETS = {
     "limits": Target(_of_text(parse_changes, lambda text: parse_rates(text.split(";")))),
     "exit": Target(_of_text(parse_exit, parse_dora_error, parse_filter)),
     "parcel": Target(_parcel, REFUSED),
+    "link": Target(_link),
     "dora-version": Target(
         lambda data: version_numbers(parse_dora_version(text_of(data)) or text_of(data))
     ),

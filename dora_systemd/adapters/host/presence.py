@@ -20,7 +20,7 @@ class Presence(NamedTuple):
     """
 
     reason: str = ""  # why it cannot be used, or ""
-    identity: tuple[int, int, int] | None = None  # of a device
+    identity: tuple[int, ...] | None = None  # of a device or an interface
 
 
 def look_at(path: str) -> Presence:

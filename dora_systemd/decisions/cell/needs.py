@@ -1,7 +1,7 @@
 """What a dataflow and its nodes need before they start: the words of the setting `needs`.
 
-A dataflow needs units, and systemd waits for them. A node needs paths, and the runner waits for
-them. `NODE=PATH` is the need of a node where no key names the node: in a flag.
+A dataflow needs units, and systemd waits for them. A node needs paths and network interfaces, and
+the runner waits for them. `NODE=PATH` is the need of a node where no key names the node: in a flag.
 """
 
 import re
@@ -14,20 +14,26 @@ from dora_systemd.names import check_known, did_you_mean, is_name, is_node_id
 from dora_systemd.values import quoted
 
 NETWORK, CLOCK = "network", "clock"
-DATAFLOW, UNIT, MOUNT = "dataflow:", "unit:", "mount:"
-WORDS = (NETWORK, CLOCK, DATAFLOW, UNIT, MOUNT)
+DATAFLOW, UNIT, MOUNT, NET = "dataflow:", "unit:", "mount:", "net:"
+WORDS = (NETWORK, CLOCK, DATAFLOW, UNIT, MOUNT, NET)
 FOREIGN = (DATAFLOW, UNIT, MOUNT)
 """Needs that make systemd start what may be another user's."""
 
 _UNIT_NAME = re.compile(r"[A-Za-z0-9:_.\\@-]{1,240}\.(?:service|socket|target|mount|device|path)")
-_HINT = "valid values: network, clock, dataflow:NAME, unit:NAME, mount:PATH, and PATH for a node"
+_INTERFACE = re.compile(r"[!-~]{1,15}")
+"""At most IFNAMSIZ bytes with the final zero, as dev_valid_name() of the kernel."""
+_OF_NODES = ("/", NET)
+_HINT = (
+    "valid values: network, clock, dataflow:NAME, unit:NAME, mount:PATH, and for a node "
+    "PATH and net:INTERFACE"
+)
 
 
 class NodeNeed(NamedTuple):
-    """A path that has to be there before the program of `node` is executed."""
+    """What has to be there before the program of `node` is executed."""
 
     node: str
-    path: str
+    what: str  # a path, or net:INTERFACE
 
 
 def parse_needs(texts: Sequence[str]) -> tuple[str, ...]:
@@ -39,13 +45,15 @@ def _parse_need(text: str) -> str:
     if text in (NETWORK, CLOCK):
         return text
     kind, colon, value = text.partition(":")
-    if colon and f"{kind}:" in FOREIGN and "=" not in kind:
+    if colon and kind in _PARSERS:
         return f"{kind}:{_PARSERS[kind](value, text)}"
-    node, equals, path = text.partition("=")
+    node, equals, what = text.partition("=")
     if text.startswith("/"):
         return _parse_path(text, text)
-    if equals and is_node_id(node) and path.startswith("/"):
-        return f"{node}={_parse_path(path, text)}"
+    if equals and is_node_id(node) and what.startswith("/"):
+        return f"{node}={_parse_path(what, text)}"
+    if equals and is_node_id(node) and what.startswith(NET):
+        return f"{node}={NET}{_parse_interface(what.removeprefix(NET), text)}"
     raise _refusal(text, did_you_mean(text, WORDS) or _HINT)
 
 
@@ -69,7 +77,19 @@ def _parse_path(value: str, text: str) -> str:
     return f"/{str(path).lstrip('/')}"
 
 
-_PARSERS = {"dataflow": _parse_name, "unit": _parse_unit, "mount": _parse_path}
+def _parse_interface(value: str, text: str) -> str:
+    if not _INTERFACE.fullmatch(value) or value in (".", "..") or {*value} & {*"/:%"}:
+        hint = "write the name of a network interface, such as net:can0: 1 to 15 characters"
+        raise _refusal(text, f"{hint}, without blanks, '/', ':' and '%'")
+    return value
+
+
+_PARSERS = {
+    "dataflow": _parse_name,
+    "unit": _parse_unit,
+    "mount": _parse_path,
+    "net": _parse_interface,
+}
 
 
 def _refusal(text: str, hint: str) -> DoraSystemdError:
@@ -87,34 +107,36 @@ def split_needs(
     """The needs of the dataflow, and those of nodes.
 
     given: of the dataflow, and with a node in front. by_node: from `nodes:` in settings files.
-    Raises DoraSystemdError (BAD_INPUT) for a path that the dataflow needs, and for a unit that a
-    node needs.
+    Raises DoraSystemdError (BAD_INPUT) for a path or an interface that the dataflow needs, and for
+    a unit that a node needs.
     """
-    if lonely := next((one for one in given if one.startswith("/")), None):
+    if lonely := next((one for one in given if one.startswith(_OF_NODES)), None):
+        kind = "a network interface" if lonely.startswith(NET) else "a path"
         raise DoraSystemdError(
-            f"cannot wait for {quoted(lonely)}: a path is what a node needs",
+            f"cannot wait for {quoted(lonely)}: {kind} is what a node needs",
             f"write nodes: NODE: needs: {lonely}, or --needs NODE={lonely}",
             ExitCode.BAD_INPUT,
         )
     for node, texts in by_node.items():
-        _check_paths(node, texts)
+        _check_of_node(node, texts)
     named = [NodeNeed(*one.split("=", 1)) for one in given if _is_of_node(one)]
-    listed = [NodeNeed(node, path) for node, paths in by_node.items() for path in paths]
+    listed = [NodeNeed(node, one) for node, texts in by_node.items() for one in texts]
     of_dataflow = tuple(one for one in given if not _is_of_node(one))
     return of_dataflow, tuple(dict.fromkeys((*listed, *named)))
 
 
 def _is_of_node(need: str) -> bool:
-    return "=/" in need and not is_foreign(need)
+    node, equals, what = need.partition("=")
+    return bool(equals) and is_node_id(node) and what.startswith(_OF_NODES)
 
 
-def _check_paths(node: str, needs: Sequence[str]) -> None:
-    if wrong := next((one for one in needs if not one.startswith("/")), None):
+def _check_of_node(node: str, needs: Sequence[str]) -> None:
+    if wrong := next((one for one in needs if not one.startswith(_OF_NODES)), None):
         raise DoraSystemdError(
-            f"node {node} cannot wait for {quoted(wrong)}: a node needs paths",
+            f"node {node} cannot wait for {quoted(wrong)}: a node needs paths and net:INTERFACE",
             f"write needs: {wrong} outside of nodes:, for the whole dataflow"
             if not _is_of_node(wrong)
-            else "write the path alone",
+            else f"write {wrong.partition('=')[2]} alone",
             ExitCode.BAD_INPUT,
         )
 
@@ -127,7 +149,7 @@ def check_needs(needs: Sequence[NodeNeed], nodes: Mapping[str, bool]) -> None:
     check_known("cannot wait for what is needed by", {one.node: one for one in needs}, [*nodes])
     if other := next((one for one in needs if not nodes[one.node]), None):
         raise DoraSystemdError(
-            f"node {other.node} cannot wait for {other.path}: dora itself starts this node",
+            f"node {other.node} cannot wait for {other.what}: dora itself starts this node",
             "operators, ros2, dynamic nodes and path_sha256: write needs: for another node",
             ExitCode.BAD_INPUT,
         )
@@ -137,13 +159,13 @@ def parse_node_need(text: str) -> NodeNeed:
     """The need of a node in the runner's command line. Raises DoraSystemdError (USAGE)."""
     [need] = parse_needs([text])
     if not _is_of_node(need):
-        raise _refusal(text, "write NODE=PATH")
+        raise _refusal(text, "write NODE=PATH or NODE=net:INTERFACE")
     return NodeNeed(*need.split("=", 1))
 
 
-def paths_by_node(needs: Sequence[NodeNeed]) -> dict[str, tuple[str, ...]]:
-    """Return the paths that each node needs, in their order."""
+def needs_by_node(needs: Sequence[NodeNeed]) -> dict[str, tuple[str, ...]]:
+    """Return what each node needs, in its order."""
     found: dict[str, tuple[str, ...]] = {}
-    for node, path in needs:
-        found[node] = (*found.get(node, ()), path)
+    for node, what in needs:
+        found[node] = (*found.get(node, ()), what)
     return found

@@ -75,7 +75,7 @@ class RunnerOptions(NamedTuple):
     watchdogs: Mapping[str, int] = {}
     node_rights: "tuple[NodeRights, ...]" = ()
     owes: "tuple[Owed, ...]" = ()  # outputs of nodes that have to come in time
-    needs: tuple[NodeNeed, ...] = ()  # the paths that single nodes wait for
+    needs: tuple[NodeNeed, ...] = ()  # paths and interfaces that single nodes wait for
     placed: tuple[Placed, ...] = ()  # the nodes that run on other machines than the head
     # machine, head: on a member its name, and the host name of the head; else ""
     machine: str = ""

@@ -249,5 +249,5 @@ def _refused(options: RunnerOptions, settings: Settings) -> Iterator[tuple[str, 
     # The head starts all nodes by dora, and would take a node that waits on a member for late.
     for need in options.needs:
         if need.node in away:
-            reason = f"node {need.node} is on machine {away[need.node]}, and waits for {need.path}"
+            reason = f"node {need.node} is on machine {away[need.node]}, and waits for {need.what}"
             yield reason, "leave needs of this node out"

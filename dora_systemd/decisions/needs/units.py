@@ -5,13 +5,14 @@ starts the runner, so no restart and no timeout is used up.
 
 Devices that nodes need are opened in the sandbox by the group of the device: DeviceAllow= with a
 path is resolved when the unit starts, so a device that is plugged in later would stay closed. A
-group of /proc/devices stands for all devices of one driver, see systemd.resource-control(5).
+group of /proc/devices stands for all devices of one driver, see systemd.resource-control(5). A CAN
+bus is opened by its socket family.
 """
 
 import re
 from collections.abc import Iterable
 
-from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NETWORK, UNIT, NodeNeed
+from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NET, NETWORK, UNIT, NodeNeed
 from dora_systemd.decisions.properties.assignments import typed, with_assignments
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.names import name_from_unit, unit_name
@@ -127,13 +128,18 @@ _ALWAYS = frozenset(f"/dev/{one}" for one in ("null", "zero", "full", "random", 
 
 def device_entries(needs: Iterable[NodeNeed]) -> tuple[str, ...]:
     """The values of DeviceAllow= for what nodes need below /dev."""
-    entries = (entry for one in needs for entry in _entries(one.path))
+    entries = (entry for one in needs for entry in _entries(one.what))
     return tuple(dict.fromkeys(f"{entry} rw" for entry in entries))
+
+
+def needs_can(needs: Iterable[NodeNeed]) -> bool:
+    """Whether a node needs an interface that is a CAN bus by its name: it may not exist yet."""
+    return any(one.what.startswith(NET) and "can" in one.what.lower() for one in needs)
 
 
 def lone_devices(needs: Iterable[NodeNeed]) -> tuple[NodeNeed, ...]:
     """The needed devices that have no group here: they stay closed unless the start finds them."""
-    return tuple(one for one in needs if one.path not in _ALWAYS and one.path in _entries(one.path))
+    return tuple(one for one in needs if one.what not in _ALWAYS and one.what in _entries(one.what))
 
 
 def _entries(path: str) -> tuple[str, ...]:

@@ -39,6 +39,8 @@ _CALLS = (
     "SystemCallErrorNumber=EPERM",
     "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK",
 )
+_CAN = "RestrictAddressFamilies=AF_CAN"
+"""It adds to the families of _CALLS."""
 # Mounts, capabilities and BPF need the system manager. A user's manager would need user namespaces,
 # and fail if the kernel or a container does not allow them.
 _FILES = (
@@ -68,6 +70,7 @@ class Sandbox:
     is_user: bool = False  # of a user's manager
     is_root: bool = False  # the nodes run as root
     has_devices: bool = False  # some devices are allowed by name
+    has_can: bool = False  # the nodes use a CAN bus
     is_realtime: bool = False  # the nodes have realtime scheduling
     has_rights: bool = False  # some node has rights that a program sets before it
     has_identity: bool = True  # the user fits into a namespace with the first 65536 ids
@@ -133,6 +136,7 @@ def _assignments(sandbox: Sandbox) -> list[str]:
     is_strict = sandbox.level == "strict"
     found += _CALLS
     found += _STRICT_CALLS if is_strict else ()
+    found += [_CAN] if sandbox.has_can else []
     if not sandbox.is_realtime:
         # A realtime dataflow may change the scheduling of its threads.
         found += ["RestrictRealtime=yes"]

@@ -8,14 +8,16 @@ from dora_systemd.decisions.settings.kinds import Setting, many_texts
 NEEDS = Setting[tuple[str, ...]](
     "needs",
     many_texts(
-        "network, clock, dataflow:NAME, unit:NAME, mount:PATH, or a list of them; paths for a node",
+        "network, clock, dataflow:NAME, unit:NAME, mount:PATH, or a list of them; for a node "
+        "paths and net:INTERFACE",
         "NEED",
         parse_needs,
         list,
         add,
     ),
     (),
-    "What to wait for: network, clock, dataflow:NAME, unit:NAME, mount:PATH, or NODE=PATH.",
+    "What to wait for: network, clock, dataflow:NAME, unit:NAME, mount:PATH, NODE=PATH, or "
+    "NODE=net:INTERFACE.",
     per_node=True,
     raises=lambda needs: any(one.startswith(FOREIGN) for one in needs),
 )

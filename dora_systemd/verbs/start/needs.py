@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NETWORK, NodeNeed
+from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NET, NETWORK, NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.needs.units import (
     CLOCK_WAITERS,
@@ -18,6 +18,7 @@ from dora_systemd.decisions.needs.units import (
     required_units,
 )
 from dora_systemd.decisions.needs.waiting import START, WAITS, format_wait
+from dora_systemd.decisions.properties.sandbox import Sandbox
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit, unit_name
 from dora_systemd.values import shown
@@ -124,16 +125,19 @@ def clock_service() -> str:
 
 
 def needs_warnings(
-    needs: tuple[str, ...], nodes: tuple[NodeNeed, ...], has_mounts: bool, allowed: tuple[str, ...]
+    needs: tuple[str, ...], nodes: tuple[NodeNeed, ...], sandbox: Sandbox, allowed: tuple[str, ...]
 ) -> Iterator[str]:
     """Yield warnings about needs that nothing on this machine meets.
 
-    has_mounts: the sandbox has a /tmp of its own, and closes devices. allowed: DeviceAllow= of the
-    settings.
+    allowed: DeviceAllow= of the settings.
     """
     if CLOCK in needs and not clock_service():
         yield "nothing waits for the clock: neither systemd-timesyncd nor chrony is installed"
-    if has_mounts:
+    if sandbox.network == "private":
+        for node, what in nodes:
+            if what.startswith(NET) and what != f"{NET}lo":
+                yield f"node {node} waits for {what}, but a private network has only net:lo"
+    if sandbox.has_mounts:
         yield from _sandbox_warnings(nodes, allowed)
 
 

@@ -14,7 +14,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import has_process_rights
 from dora_systemd.decisions.cell.uv import uv_project
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.needs.units import device_entries
+from dora_systemd.decisions.needs.units import device_entries, needs_can
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
@@ -60,6 +60,7 @@ def make_sandbox(
         is_root=user is not None and user.pw_uid == 0,
         has_devices=bool(settings[DEVICE] or device_entries(options.needs))
         or _names(settings, "DeviceAllow"),
+        has_can=needs_can(options.needs),
         is_realtime=settings[REALTIME] is not None or any(one.priority for one in rights),
         has_rights=has_process_rights(rights) or any(map(has_cpus, options.node_limits)),
         # In a user namespace the given capabilities would have no effect.

@@ -54,7 +54,7 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
         *plan.warnings,
         *idle_warnings(plan.settings),
         *watch_warnings(plan),
-        *needs_warnings(needs, plan.options.needs, plan.sandbox.has_mounts, allowed),
+        *needs_warnings(needs, plan.options.needs, plan.sandbox, allowed),
     )
     warnings = (*warnings, *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))

@@ -5,9 +5,9 @@ import pytest
 from dora_systemd.decisions.cell.needs import (
     NodeNeed,
     check_needs,
+    needs_by_node,
     parse_needs,
     parse_node_need,
-    paths_by_node,
     split_needs,
 )
 from dora_systemd.decisions.needs.units import needs_properties
@@ -30,6 +30,7 @@ def test_each_need_is_kept_once_and_in_its_shortest_form() -> None:
         *(
             "",
             "net",
+            "net:",
             "dataflow:",
             "dataflow:a/b",
             "unit:nginx",
@@ -59,6 +60,39 @@ def test_other_words_are_refused_in_one_line(text: str) -> None:
     assert caught.value.hint
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("", ".", "..", "a/b", "a:b", "can%d", "can 0", "can0\x07", "can0\n", "cän0"),
+        *("sixteen-letters0", "x" * 4096),
+    ],
+)
+def test_an_interface_that_cannot_be_is_refused(name: str) -> None:
+    for text in (f"net:{name}", f"arm=net:{name}"):
+        if name == "can0\n":  # the end of a line is no part of a need
+            assert parse_needs([text]) == (text.strip(),)
+            continue
+        with pytest.raises(DoraSystemdError) as caught:
+            parse_needs([text])
+        assert "\n" not in caught.value.message
+        assert "net:can0" in caught.value.hint
+
+
+def test_an_interface_is_kept_as_the_kernel_names_it() -> None:
+    texts = ("net:fifteen-letters", "arm=net:can0", "net:a=b", "arm=net:enp3s0.7@", "net:7")
+    assert parse_needs(texts) == texts
+    _, nodes = split_needs(("arm=net:can0",), {"base": ("net:a=b", "/dev/a=/b")})
+    assert needs_by_node(nodes) == {"base": ("net:a=b", "/dev/a=/b"), "arm": ("net:can0",)}
+    assert parse_node_need("arm=net:a=b") == NodeNeed("arm", "net:a=b")
+
+
+def test_a_dataflow_needs_no_interface() -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        split_needs(("net:can0",), {})
+    assert caught.value.message.endswith("a network interface is what a node needs")
+    assert "nodes: NODE: needs: net:can0" in caught.value.hint
+
+
 def test_a_word_that_is_nearly_right_gets_a_hint() -> None:
     with pytest.raises(DoraSystemdError) as caught:
         parse_needs(["netwrok"])
@@ -74,7 +108,7 @@ def test_paths_are_for_nodes_and_units_for_the_dataflow() -> None:
         NodeNeed("camera", "/dev/video0"),
     )
     assert needs == (("network",), nodes)
-    assert paths_by_node(nodes)["arm"] == ("/dev/ttyUSB0", "/dev/ttyUSB1")
+    assert needs_by_node(nodes)["arm"] == ("/dev/ttyUSB0", "/dev/ttyUSB1")
     with pytest.raises(DoraSystemdError):
         split_needs(("/dev/video0",), {})
     for texts in (("network",), ("b=/x",)):

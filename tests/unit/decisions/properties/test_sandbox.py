@@ -46,6 +46,7 @@ sandboxes = st.builds(
     is_user=st.booleans(),
     is_root=st.booleans(),
     has_devices=st.booleans(),
+    has_can=st.booleans(),
     is_realtime=st.booleans(),
     has_identity=st.booleans(),
     needed=st.lists(places).map(tuple),
@@ -68,6 +69,15 @@ def test_levels_only_add() -> None:
     assert DEFAULT.keys() < STRICT.keys()
     changed = {slot for slot, one in DEFAULT.items() if STRICT[slot] != one}
     assert changed == {"ProtectHome", "PrivateUsers"}
+
+
+def test_a_can_bus_opens_its_socket_family() -> None:
+    others = ("AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK")
+    assert value(Sandbox(), "RestrictAddressFamilies") == (True, others)
+    for is_user in (False, True):
+        found = value(Sandbox(has_can=True, is_user=is_user), "RestrictAddressFamilies")
+        assert found == (True, (*others, "AF_CAN"))
+    assert sandbox_properties(Sandbox(level="none", has_can=True)) == {}
 
 
 @given(sandboxes)

@@ -3,6 +3,7 @@
 import pytest
 
 from dora_systemd.decisions.cell.needs import NodeNeed
+from dora_systemd.decisions.properties.sandbox import Sandbox
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import need_failure
 from dora_systemd.verbs.start.needs import needs_warnings
@@ -13,23 +14,31 @@ NEEDS = (NodeNeed("arm", "/dev/odd"), NodeNeed("arm", "/dev/video0"))
 
 
 def test_a_device_without_a_group_may_stay_closed() -> None:
-    (told,) = needs_warnings((), NEEDS, True, ("/dev/odd rw",))
+    (told,) = needs_warnings((), NEEDS, Sandbox(), ("/dev/odd rw",))
     assert told.startswith(
         "node arm waits for /dev/odd, but the sandbox opens it only if it is there at the start"
     )
 
 
 def test_a_device_whose_group_is_allowed_is_not_told() -> None:
-    assert not [*needs_warnings((), NEEDS, True, ("char-odd rw",))]
+    assert not [*needs_warnings((), NEEDS, Sandbox(), ("char-odd rw",))]
 
 
 def test_without_a_sandbox_nothing_is_closed() -> None:
-    assert not [*needs_warnings((), (*NEEDS, NodeNeed("arm", "/tmp/map")), False, ())]
+    assert not [*needs_warnings((), (*NEEDS, NodeNeed("arm", "/tmp/map")), Sandbox("none"), ())]
 
 
 def test_the_sandbox_has_its_own_tmp() -> None:
-    (told,) = needs_warnings((), (NodeNeed("arm", "/tmp/map"),), True, ())
+    (told,) = needs_warnings((), (NodeNeed("arm", "/tmp/map"),), Sandbox(), ())
     assert told == "node arm waits for /tmp/map, but the sandbox has its own /tmp"
+
+
+@pytest.mark.parametrize("level", ["default", "none"])
+def test_a_private_network_has_no_interfaces_of_the_machine(level: str) -> None:
+    needs = (NodeNeed("arm", "net:can0"), NodeNeed("arm", "net:lo"))
+    assert not [*needs_warnings((), needs, Sandbox(level), ())]
+    (told,) = needs_warnings((), needs, Sandbox(level, "private"), ())
+    assert told == "node arm waits for net:can0, but a private network has only net:lo"
 
 
 def test_what_needs_a_dataflow_ends_with_it() -> None:

@@ -5,7 +5,12 @@ import pytest
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NODE_STATES, NodeStatus
 from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
-from dora_systemd.decisions.needs.units import device_entries, format_awaited, lone_devices
+from dora_systemd.decisions.needs.units import (
+    device_entries,
+    format_awaited,
+    lone_devices,
+    needs_can,
+)
 
 GONE = "/dev/video0 (not there)"
 OPEN = frozenset({"camera"})
@@ -70,6 +75,13 @@ def test_the_sandbox_opens_the_group_of_a_device() -> None:
     assert device_entries(NodeNeed("camera", path) for path in paths) == (
         *("char-video4linux rw", "char-ttyUSB rw", "char-ttyACM rw", "/dev/odd rw"),
     )
+
+
+def test_a_can_bus_is_known_by_its_name() -> None:
+    for name in ("can0", "vcan1", "arm-CAN"):
+        assert needs_can([NodeNeed("log", "/srv/can"), NodeNeed("arm", f"net:{name}")])
+    assert not needs_can([NodeNeed("arm", "/dev/can0"), NodeNeed("lidar", "net:eth0")])
+    assert device_entries([NodeNeed("arm", "net:can0")]) == ()
 
 
 def test_a_device_without_a_group_is_told() -> None:
