@@ -85,7 +85,7 @@ async def run_cell(
     already. Raises what prevents a run.
     """
     loop, options = asyncio.get_running_loop(), resolved(given)
-    journal, clock = JournalSocket(), StopClock(options.grace)
+    journal, clock = JournalSocket(), StopClock(options)
     # systemd holds the pipes too, so their content survives a kill of this process.
     this_life = begin_life(options, paths.is_of_user)
     spent = find_spent(options, paths)
@@ -240,9 +240,15 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             is_trial=reloader.before is not None,
             notice=reloader.notice,
             is_attached=options.attached,
+            stops={one.node: one for one in options.stops},
+            stop_limit=options.stop_limit,
         )
         pump = Pump(role.cell(cell), runs.this_life, runs.paths, runs.nodes, runs.pipes)
         dialogue = role.dialogue(options, pump, dora, runs.nodes, runs.pipes)
+        if own.stops:
+            from dora_systemd.runner.cell.node_stops import NodeStops
+
+            pump.on_node = NodeStops(pump, dora, runs.nodes, dialogue).perform
         variables = daemon_variables(own, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
         runs.pipes.mute()

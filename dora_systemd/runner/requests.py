@@ -28,6 +28,7 @@ from dora_systemd.decisions.cell.status import (
     format_asked,
     is_stopped,
 )
+from dora_systemd.decisions.cell.stops import within_of
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.node_table import held, is_over_but_for_held
@@ -148,11 +149,11 @@ class NodeRequests:
         if run is None:
             raise _not_running("no node runs")
         async with run.lock:
-            target = self._target(run, node, run.pump.cell.grace if grace is None else grace)
+            target = self._target(run, node, grace)
             do = self._restart if what == RESTART else self._stop
             return {"done": [await do(run, target, by)]}
 
-    def _target(self, run: Run, node: str, grace: int) -> Target:
+    def _target(self, run: Run, node: str, given: int | None) -> Target:
         status = run.pump.cell.nodes.get(node)
         if status is None:
             message = f"cannot find a node {quoted(node)} in the dataflow"
@@ -161,7 +162,9 @@ class NodeRequests:
             hint = "it belongs to whoever has started it"
             raise DoraSystemdError(f"cannot do that: {node} is a dynamic node", hint)
         definition = self._role.definition(self._reloader.definition(node))
-        return Target(node, status, definition, self._reloader.has_readers(node), grace)
+        cell, has_readers = run.pump.cell, self._reloader.has_readers(node)
+        grace = within_of(cell.stops, node, cell.grace) if given is None else given
+        return Target(node, status, definition, has_readers, grace)
 
     def _hand_of(self, run: Run) -> Hand:
         if self._hand is None or self._hand.run is not run:

@@ -221,8 +221,9 @@ def _stop_outcome(
 
 
 def _killed(scope: Scope, cell: Cell, begin: int) -> str:
-    """The nodes that dora had to kill since then. Only a slow stop needs the journal."""
-    delay = kill_delay(cell.options.grace)
+    """The nodes that had to be killed since then. Only a slow stop needs the journal."""
+    options = cell.options
+    delay = min([kill_delay(options.grace), *(one.within for one in options.stops if one.within)])
     if time.time_ns() // _MICROSECOND_NS - begin < delay:
         return ""
     # Imported late: most stops are fast.
@@ -231,7 +232,8 @@ def _killed(scope: Scope, cell: Cell, begin: int) -> str:
     nodes = []
     with suppress(DoraSystemdError):
         nodes = JournalReader().killed_since(scope, cell.name, cell.uuid, begin)
-    return f"killed after {format_duration(delay)}: {', '.join(nodes)}" if nodes else ""
+    after = "their time" if options.stops else format_duration(delay)
+    return f"killed after {after}: {', '.join(nodes)}" if nodes else ""
 
 
 def _stopped(cell: Cell, note: str) -> str:

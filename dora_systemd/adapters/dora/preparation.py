@@ -22,6 +22,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import check_owes
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
 from dora_systemd.decisions.cell.rights import check_rights_nodes
+from dora_systemd.decisions.cell.stops import check_stops
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
     Dataflow,
@@ -96,6 +97,8 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     check_restart_nodes(options.node_restarts, ids)
     launched = {node.id for node in dataflow.nodes if has_launcher(node)}
     check_rights_nodes(options.node_rights, ids, launched)
+    is_apart = bool(options.placed)
+    check_stops(options.stops, options.stop_limit, options.grace, ids, is_apart)
     check_owes(options.owes, dict(options.node_restarts), dataflow.nodes)
 
 

@@ -38,10 +38,12 @@ from dora_systemd.values import (
 if TYPE_CHECKING:  # few dataflows have any, and `list` loads this module
     from dora_systemd.decisions.cell.owes import Owed
     from dora_systemd.decisions.cell.rights import NodeRights
+    from dora_systemd.decisions.cell.stops import NodeStop
 
 RUNNER_MODULE = "dora_systemd.runner"
 DEFAULT_GRACE = 10 * SECOND
-"""µs."""
+DEFAULT_STOP_LIMIT = 300 * SECOND
+"""µs, both."""
 _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 
@@ -74,6 +76,8 @@ class RunnerOptions(NamedTuple):
     # nodes with a notify socket, see dora_systemd.decisions.watchdog.watchdogs
     watchdogs: Mapping[str, int] = {}
     node_rights: "tuple[NodeRights, ...]" = ()
+    stops: "tuple[NodeStop, ...]" = ()  # of single nodes
+    stop_limit: int = DEFAULT_STOP_LIMIT  # µs for a stop, if there are `stops`
     owes: "tuple[Owed, ...]" = ()  # outputs of nodes that have to come in time
     needs: tuple[NodeNeed, ...] = ()  # paths and interfaces that single nodes wait for
     placed: tuple[Placed, ...] = ()  # the nodes that run on other machines than the head
@@ -139,6 +143,9 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
 _parse_rights = _late("cell.rights", "parse_node_rights")
 _format_rights = _late("cell.rights", "format_node_rights")
 _parse_owed, _format_owed = (_late("cell.owes", name) for name in ("parse_owed", "format_owed"))
+_parse_stop, _format_stop = (
+    _late("cell.stops", name) for name in ("parse_node_stop", "format_node_stop")
+)
 _parse_watchdogs = _late("watchdog.watchdogs", "parse_sockets")
 
 
@@ -163,6 +170,8 @@ _OPTIONS = (
     _each("node-rights", "node_rights", _parse_rights, _format_rights),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
     _each("owes", "owes", _parse_owed, _format_owed),
+    _each("stop", "stops", _parse_stop, _format_stop),
+    _unless_default("stop-limit", "stop_limit", parse_duration, format_duration),
     Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("needs", "needs", parse_node_need, "=".join),
     _each("placed", "placed", parse_placed, "=".join),

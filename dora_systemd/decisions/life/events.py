@@ -191,6 +191,22 @@ class StopAnswered(Event):
 
 
 @dataclass(frozen=True)
+class NodeOverdue(Event):
+    """A node that received its stop has not ended in its time."""
+
+    node: str
+
+
+@dataclass(frozen=True)
+class NodeExtends(Event):
+    """A node that stops sends EXTEND_TIMEOUT_USEC=."""
+
+    node: str
+    wanted: int  # µs from now
+    passed_us: int  # since the stop began, by CLOCK_MONOTONIC
+
+
+@dataclass(frozen=True)
 class NodeAsked(Event):
     """A restart or a stop of one node was requested, and follows."""
 

@@ -16,7 +16,7 @@ from dataclasses import replace
 from dora_systemd.decisions.cell.exits import parse_exit
 from dora_systemd.decisions.cell.owes import FAIL
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus, is_stopped
-from dora_systemd.decisions.life import early
+from dora_systemd.decisions.life import early, stop_order
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import node_table as table
 from dora_systemd.decisions.life.causes import ESSENTIAL, Cause
@@ -29,8 +29,17 @@ from dora_systemd.decisions.life.failures import (
     oom_of_all,
     to,
 )
-from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
-from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
+from dora_systemd.decisions.life.states import (
+    Action,
+    Cell,
+    Deadline,
+    Do,
+    Record,
+    RunnerExit,
+    State,
+    StopStep,
+)
+from dora_systemd.decisions.life.stop_budget import ANSWER_MARGIN, LEAVE_TIMEOUT, stop_timeout
 from dora_systemd.values import SECOND, format_duration
 
 _NOT_READY = ("starting", "restarting")
@@ -144,9 +153,17 @@ def node_event_stopping(cell: Cell, event: life.Event) -> Next:
     """Record a node event while stopping; dismiss the daemon after the last node has exited."""
     cell, actions = node_event(cell, event)
     if table.has_process(cell.nodes):
-        return cell, actions
+        return _advance(cell, *actions)
     # Do not wait for the answer to Stop: dora sends none while a node is in its restart delay.
     return _leave(cell, *actions)
+
+
+def _advance(cell: Cell, *actions: Action) -> Next:
+    """Stop the next nodes, if the stop has an order."""
+    if not stop_order.has_order(cell):
+        return cell, actions
+    cell, stops = stop_order.advance(cell)
+    return cell, (*actions, *stops)
 
 
 def _leave(cell: Cell, *actions: Action) -> Next:
@@ -167,6 +184,10 @@ def wind_down(cell: Cell, *actions: Action) -> Next:
     """Have dora stop the nodes that have processes, or dismiss the daemon if there are none."""
     if not table.has_process(cell.nodes):
         return _leave(cell, *actions)
+    if stop_order.has_order(cell):
+        cell, stops = stop_order.advance(cell)
+        after = cell.stop_limit + ANSWER_MARGIN
+        return to(cell, State.STOPPING, *actions, *stops, after=after)
     return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
 
 
@@ -279,7 +300,11 @@ def _exit_of_stop(cell: Cell) -> RunnerExit:
     itself has worked.
     """
     ended = cell.stop_us + cell.grace
-    failed = (node for node in cell.nodes.values() if _has_failed_at_stop(node, ended))
+    failed = (
+        _has_failed_at_stop(node, ended)
+        for ident, node in cell.nodes.items()
+        if cell.ending.get(ident) is not StopStep.TERMINATED
+    )
     return RunnerExit.FAILED_AT_STOP if cell.is_attached and any(failed) else RunnerExit.OK
 
 

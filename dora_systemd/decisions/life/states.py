@@ -9,6 +9,7 @@ from dora_systemd.decisions.life.causes import Cause
 
 if TYPE_CHECKING:  # doractl needs only RunnerExit
     from dora_systemd.decisions.cell.status import NodeStatus
+    from dora_systemd.decisions.cell.stops import Stops
     from dora_systemd.decisions.descriptor.dataflow import Downstream
 
 
@@ -75,7 +76,40 @@ class Deadline:
     after: int | None
 
 
-Action = Do | Record | Deadline
+class StopStep(Enum):
+    """What was done last to end a node, in a stop that has an order."""
+
+    STOPPED = "stop"
+    TERMINATED = "SIGTERM"
+    KILLED = "SIGKILL"
+
+
+@dataclass(frozen=True)
+class StopNode:
+    """Action: have dora send a node its stop, and push NodeOverdue `after` µs."""
+
+    node: str
+    after: int
+
+
+@dataclass(frozen=True)
+class EndNode:
+    """Action: SIGTERM for a node, and NodeOverdue `after` µs; SIGKILL if that is None."""
+
+    node: str
+    after: int | None = None
+
+
+@dataclass(frozen=True)
+class GiveTime:
+    """Action: push NodeOverdue of a node `after` µs from now, unless it is due later anyway."""
+
+    node: str
+    after: int
+
+
+NodeAction = StopNode | EndNode | GiveTime
+Action = Do | Record | Deadline | NodeAction
 
 
 @dataclass(frozen=True)
@@ -109,4 +143,8 @@ class Cell:
     lost: frozenset[str] = frozenset()  # machines that had joined, and were lost
     # whether the loss of a machine leads to another run in this process
     waits_for_lost: bool = False
+    # stops, stop_limit: of single nodes, and of all together in µs; ending: what ends each node now
+    stops: "Stops" = field(default_factory=dict)
+    stop_limit: int = 0
+    ending: Mapping[str, StopStep] = field(default_factory=dict)
     early: tuple[str, ...] = ()  # nodes that ended before they called dora, and will not restart

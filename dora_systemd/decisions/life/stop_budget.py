@@ -5,10 +5,16 @@ dora ends the nodes  its answer   the daemon   journald takes  the runner has   
                                   leaves       what is left    exited           kills
 """
 
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.values import INFINITY, SECOND
 
 STOP_MARGIN = 10 * SECOND
-"""What TimeoutStopSec= allows beyond 1.5 grace durations, when dora kills the nodes."""
+"""What TimeoutStopSec= allows beyond 1.5 grace durations, when dora kills the nodes.
+
+With a setting `stop` of a node, the nodes have `stop_limit` in the place of that.
+"""
+ANSWER_MARGIN = 2 * SECOND
+"""For the answer of dora, or for what ends the last node."""
 RESERVE = SECOND
 """The runner exits this long before systemd kills it, because systemd's timer started first."""
 LEAVE_TIMEOUT = 2 * SECOND
@@ -21,15 +27,20 @@ def kill_delay(grace: int) -> int:
 
 def stop_timeout(grace: int) -> int:
     """Timeout of dora's Stop."""
-    return kill_delay(grace) + 2 * SECOND
+    return kill_delay(grace) + ANSWER_MARGIN
 
 
-def unit_timeout(grace: int) -> int:
+def nodes_timeout(options: RunnerOptions) -> int:
+    """The time after which the last node is killed."""
+    return options.stop_limit if options.stops else kill_delay(options.grace)
+
+
+def unit_timeout(options: RunnerOptions) -> int:
     """TimeoutStopSec= of the unit."""
-    return min(kill_delay(grace) + STOP_MARGIN, INFINITY)
+    return min(nodes_timeout(options) + STOP_MARGIN, INFINITY)
 
 
-def runner_timeout(grace: int) -> int:
+def runner_timeout(options: RunnerOptions) -> int:
     """The time for the runner to exit."""
-    timeout = unit_timeout(grace)
+    timeout = unit_timeout(options)
     return INFINITY if timeout == INFINITY else timeout - RESERVE

@@ -9,7 +9,7 @@ Every pair of state and event has an entry in TABLE; its unit test takes them al
 from collections.abc import Mapping
 
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life import failures, machines
+from dora_systemd.decisions.life import failures, machines, stop_order
 from dora_systemd.decisions.life import handlers as handle
 from dora_systemd.decisions.life.failures import Handler, Next
 from dora_systemd.decisions.life.states import Cell, State
@@ -81,6 +81,8 @@ _STOPPING: dict[str, Handler] = {
     **dict.fromkeys(("ChildExited", "ConnectionLost"), handle.leave_now),
     "Failed": failures.broken,
     "StopAsked": handle.stop_again,
+    "NodeOverdue": stop_order.overdue,
+    "NodeExtends": stop_order.extend,
     "MachineLost": machines.machine_lost_stopping,
     "HeadLost": machines.head_lost_stopping,
 }

@@ -17,6 +17,7 @@ from dora_systemd.decisions.cell.status import (
 from dora_systemd.decisions.life.node_table import WITH_PROCESS, is_held_up, lacking
 from dora_systemd.decisions.life.states import Cell, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import kill_delay
+from dora_systemd.decisions.life.stop_order import has_order, in_turn
 from dora_systemd.decisions.needs.waiting import format_wait
 from dora_systemd.decisions.resources.usage import CpuSample, LineCount
 from dora_systemd.decisions.watchdog.messages import Sign
@@ -65,6 +66,9 @@ def _format_stopping(cell: Cell) -> str:
     left = [ident for ident, node in cell.nodes.items() if node.state in WITH_PROCESS]
     if not left:
         return "stopping"
+    if has_order(cell):
+        now, later = in_turn(cell)
+        return f"stopping, waiting for {_names(now)}" + (f", then {_names(later)}" if later else "")
     text = f"stopping, waiting for {_names(left)}"
     if cell.grace == INFINITY:
         return text

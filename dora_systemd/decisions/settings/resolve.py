@@ -27,6 +27,7 @@ from dora_systemd.decisions.settings.owes import NOTIFY, OWES, WATCHDOG, owes_of
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
+from dora_systemd.decisions.settings.stops import STOP, STOP_LIMIT, stops_of
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
     DEBUG,
@@ -239,6 +240,8 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
+        stops=stops_of(settings.by_node(STOP)),
+        stop_limit=settings[STOP_LIMIT],
         watchdogs=watchdogs(settings),
         needs=split_needs(settings[NEEDS], settings.by_node(NEEDS))[1],
         reload=hot_reload(settings, options.working_directory),
@@ -256,7 +259,9 @@ def log_rates(settings: Settings) -> RateLimits:
 
 def watchdogs(settings: Settings) -> Watchdogs:
     """Which nodes have a watchdog or a notify socket. Raises DoraSystemdError (BAD_INPUT)."""
-    sockets = {ALL_NODES: settings[NOTIFY], **settings.by_node(NOTIFY)}
+    # A node with a time to stop can extend it.
+    timed = {one.node: True for one in stops_of(settings.by_node(STOP)) if one.within}
+    sockets = {ALL_NODES: settings[NOTIFY], **timed, **settings.by_node(NOTIFY)}
     return merge_watchdogs(settings.by_node(WATCHDOG), settings[WATCHDOG], sockets)
 
 

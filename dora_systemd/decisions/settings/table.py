@@ -30,6 +30,7 @@ from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.rights import RIGHTS_SETTINGS
 from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
+from dora_systemd.decisions.settings.stops import STOP_SETTINGS
 
 ENV = Setting[Mapping[str, str]]("env", ENVIRONMENT, {}, "Environment variable of all nodes.")
 ENV_FILE = Setting[tuple[str, ...]](
@@ -104,6 +105,7 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     "Limits": LIMIT_SETTINGS,
     "Rights of nodes": RIGHTS_SETTINGS,
     "Restarts": RESTART_SETTINGS,
+    "Stop": STOP_SETTINGS,
     "Signs of life": SIGN_SETTINGS,
     "Owed outputs": OWES_SETTINGS,
     "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),

@@ -146,9 +146,9 @@ def stop_properties(options: RunnerOptions) -> dict[str, Property]:
 
     See systemd.kill(5).
 
-    dora kills a node at 1.5 times its grace duration.
+    dora kills a node at 1.5 times its grace duration; a setting `stop` has stop_limit.
     """
-    return typed(KillMode="mixed", TimeoutStopSec=unit_timeout(options.grace))
+    return typed(KillMode="mixed", TimeoutStopSec=unit_timeout(options))
 
 
 def restart_properties(options: RunnerOptions) -> dict[str, Property]:

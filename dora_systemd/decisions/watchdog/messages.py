@@ -10,6 +10,8 @@ from dora_systemd.values import INFINITY
 
 MAX_BYTES = 4096
 """Maximum bytes of a message, as in systemd; a longer one is dropped."""
+_DIGITS = 20
+"""Of a number with 64 bits."""
 MAX_STATUS = 200
 """Characters kept of STATUS=."""
 
@@ -19,21 +21,30 @@ class Message(NamedTuple):
 
     is_alive: bool = False
     is_trigger: bool = False
+    extend: int = 0  # µs of EXTEND_TIMEOUT_USEC=, 0 without one
     status: str | None = None  # the text of STATUS=, None without one; "" clears the last text
 
 
 def parse_message(data: bytes) -> Message:
     """The message in a datagram. Whatever it contains, nothing is raised."""
     alive = trigger = False
-    status = None
+    status, extend = None, 0
     for line in data.split(b"\n"):
         key, _, value = line.partition(b"=")
         if key == b"WATCHDOG":
             alive |= value == b"1"
             trigger |= value == b"trigger"
+        elif key == b"EXTEND_TIMEOUT_USEC":
+            extend = _micros(value)
         elif key == b"STATUS":
             status = _clean(value)
-    return Message(alive, trigger, status)
+    return Message(alive, trigger, extend, status)
+
+
+def _micros(value: bytes) -> int:
+    """The number of µs, 0 for anything else."""
+    is_number = value.isdigit() and len(value) <= _DIGITS
+    return min(int(value), INFINITY) if is_number else 0
 
 
 def _clean(value: bytes) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from dora_systemd.adapters.host import notify
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.life.stop_budget import runner_timeout
 from dora_systemd.values import INFINITY, SECOND
 
@@ -48,13 +49,13 @@ class Gaps:
 
 
 class StopClock:
-    """Starts with the first stop request. grace: of the dataflow, µs.
+    """Starts with the first stop request. options: of the dataflow.
 
     by: what requested the stop, or "".
     """
 
-    def __init__(self, grace: int, now: Callable[[], float] = time.monotonic) -> None:
-        self._grace = grace
+    def __init__(self, options: RunnerOptions, now: Callable[[], float] = time.monotonic) -> None:
+        self._timeout = runner_timeout(options)
         self._now = now
         self._began = 0.0
         self.by = ""
@@ -66,9 +67,8 @@ class StopClock:
 
     def left(self, most: float) -> float:
         """Return the seconds left for a step that may take at most `most` seconds."""
-        timeout = runner_timeout(self._grace)
-        if self.by and timeout != INFINITY:
-            most = min(most, self._began + timeout / SECOND - self._now())
+        if self.by and self._timeout != INFINITY:
+            most = min(most, self._began + self._timeout / SECOND - self._now())
         return max(most, 0.0)
 
     def for_journal(self) -> Callable[[], float]:

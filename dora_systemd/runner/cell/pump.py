@@ -25,7 +25,16 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
-from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.states import (
+    Action,
+    Cell,
+    Deadline,
+    Do,
+    NodeAction,
+    Record,
+    RunnerExit,
+    State,
+)
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status, is_up
 from dora_systemd.decisions.logs.journal_events import END_EVENTS, NODE_END_EVENTS
@@ -56,7 +65,8 @@ class Pump:
 
     this_life: the same for all runs of a life. Call connect() before the first push().
     end: resolves to the exit status, even if the action EXIT fails. amend: adds the nodes of other
-    machines to the table. on_event: receives each event before the event changes the cell.
+    machines to the table. on_event: receives each event before the event changes the cell. on_node:
+    carries out the actions of a stop that has an order.
     """
 
     def __init__(
@@ -78,6 +88,7 @@ class Pump:
         self._is_ready = False
         self._is_unwritten = False
         self.on_event: Callable[[life.Event], None] = lambda _: None
+        self.on_node: Callable[[NodeAction], None] = lambda _: None
         self.amend: Callable[[CellStatus], CellStatus] = lambda table: table
         self._waiting: list[tuple[Callable[[Cell], bool], asyncio.Future[None]]] = []
 
@@ -146,6 +157,8 @@ class Pump:
                 self._record(action)
             case Deadline():
                 self._set_deadline(action.after)
+            case _:
+                self.on_node(action)
 
     def _record(self, record: Record) -> None:
         with self._guard(f"do what comes before the event {record.event}"):
@@ -253,3 +266,5 @@ def _name(action: Action) -> str:
             return f"write the event {action.event}"
         case Deadline():
             return "set its deadline"
+        case _:
+            return f"end node {action.node}"

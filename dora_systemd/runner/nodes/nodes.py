@@ -37,7 +37,10 @@ _GONE_SECONDS = 0.05
 
 
 class Nodes:
-    """The node groups below `unit`, the cgroup directory of the unit, and the nodes' pipes."""
+    """The node groups below `unit`, the cgroup directory of the unit, and the nodes' pipes.
+
+    stop_dues: CLOCK_MONOTONIC µs at which nodes that stop get the next signal, by node.
+    """
 
     def __init__(
         self, unit: Path, paths: CellPaths, pipes: LogPipes, watchdogs: Watchdogs = NO_WATCHDOGS
@@ -54,6 +57,7 @@ class Nodes:
         self.resources = Resources(unit)
         self.notify_sockets = _notify_sockets(watchdogs, unit, paths, pipes) if watchdogs else None
         self.gates = Gates(paths)
+        self.stop_dues: dict[str, int] = {}
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
         """Create a group for every node, with its limits, and pipes for the nodes that use them.

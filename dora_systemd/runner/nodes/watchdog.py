@@ -81,7 +81,7 @@ class NotifySockets:
     """The sockets of the nodes that `watchdogs` gives one. unit: its cgroup directory.
 
     `tell`: writes a life event. is_in: whether a process is in a group. clock_us: CLOCK_MONOTONIC.
-    on_news: is called after each message.
+    on_news: is called after each message. on_extend: receives EXTEND_TIMEOUT_USEC= of a node.
     """
 
     def __init__(
@@ -104,6 +104,7 @@ class NotifySockets:
         limits = filter(None, watchdogs.values())
         self.clock = Clock(period_of(limits), clock_us())
         self.on_news: Callable[[], None] = lambda: None
+        self.on_extend: Callable[[str, int], None] = lambda *_: None
 
     def make(self, node: str) -> None:
         """Create the node's notify socket, if it is configured and does not exist yet.
@@ -175,7 +176,10 @@ class NotifySockets:
             if reason := self._doubt(node, pending):
                 self._refuse(node, entry, pending, reason)
             else:
-                entry.receive(parse_message(pending.data), self.clock)
+                message = parse_message(pending.data)
+                entry.receive(message, self.clock)
+                if message.extend:
+                    self.on_extend(node, message.extend)
                 self.on_news()
         return True
 

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dora_systemd.decisions.cell.status import RESTART, NodeStatus
+from dora_systemd.decisions.cell.stops import within_of
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State
@@ -91,9 +92,10 @@ class Swapper:
         self._engine = dora
 
     def target(self, definition: Mapping[str, Any], has_readers: bool) -> Target:
-        """The node with this definition as it is now, with the grace period of the dataflow."""
+        """The node with this definition as it is now, with the time that it has to stop."""
         node, cell = str(definition["id"]), self._pump.cell
-        return Target(node, cell.nodes[node], definition, has_readers, cell.grace)
+        grace = within_of(cell.stops, node, cell.grace)
+        return Target(node, cell.nodes[node], definition, has_readers, grace)
 
     async def swap(
         self, definition: Mapping[str, Any], kind: str, has_readers: bool, starts_first: bool

@@ -89,6 +89,7 @@ LATE = {
         "adapters.dora.preparation": {"adapters.dora.probe", "decisions.machines.part"},
         "runner.main": {
             *("runner.machines.head", "runner.machines.member", "runner.needs"),
+            "runner.cell.node_stops",
             "runner.owes.watch",
         },
         "verbs.facts.reading": {

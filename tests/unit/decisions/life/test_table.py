@@ -8,14 +8,15 @@ import pytest
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.owes import THEN
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
-from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.table import TABLE, step
 from dora_systemd.decisions.life.view import is_up
 from dora_systemd.decisions.logs.journal_events import END_EVENTS
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 
 SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     life.CoordinatorListening: (life.CoordinatorListening(1),),
@@ -55,6 +56,11 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     life.StopAsked: (life.StopAsked(1, "SIGTERM"),),
     life.StopAnswered: (life.StopAnswered(1),),
     life.NodeReloading: (life.NodeReloading(1, "a"),),
+    life.NodeOverdue: (life.NodeOverdue(1, "a"), life.NodeOverdue(1, "unknown")),
+    life.NodeExtends: (
+        life.NodeExtends(1, "a", SECOND, 0),
+        life.NodeExtends(1, "unknown", INFINITY, SECOND),
+    ),
     life.NodeAsked: (
         life.NodeAsked(1, "a", "restart", "root"),
         life.NodeAsked(1, "a", "stop", "root"),
@@ -90,17 +96,25 @@ def test_the_table_is_total() -> None:
 EACH = [event for events in SAMPLES.values() for event in events]
 
 
+ORDERED: dict[str, object] = {
+    "ready_us": 1,
+    "stops": {"a": NodeStop("a", SECOND, ("b",))},
+    "stop_limit": 60 * SECOND,
+}
+
+
+@pytest.mark.parametrize("changes", [{}, ORDERED], ids=["plain", "ordered"])
 @pytest.mark.parametrize("state", State)
-def test_every_pair(state: State) -> None:
+def test_every_pair(state: State, changes: dict[str, object]) -> None:
     for event in EACH:
-        after, actions = step(cell(state), event)
+        after, actions = step(cell(state, **changes), event)
         is_end = after.state is State.ENDED and state is not State.ENDED
         assert (Do.EXIT in actions) == is_end, event
         if after.state is not state:
             deadlines = [one for one in actions if isinstance(one, Deadline)]
             assert len(deadlines) == 1, f"{event}: a change of state sets or clears the deadline"
         if state is State.ENDED:
-            assert (after, actions) == (cell(state), ()), event
+            assert (after, actions) == (cell(state, **changes), ()), event
 
 
 @pytest.mark.parametrize("state", [s for s in State if s is not State.ENDED])
@@ -116,6 +130,7 @@ def test_each_state_ends_when_it_is_told_to_and_nothing_answers(state: State) ->
 LIVING = [state for state in State if state is not State.ENDED]
 CHANGES: list[dict[str, object]] = [
     {},
+    ORDERED,
     {"stop_by": "SIGTERM"},
     {"is_trial": True, "stop_by": "SIGTERM"},
     {"failure": "node a: exit code 1", "exit": RunnerExit.NODES_FAILED},
@@ -159,11 +174,9 @@ def test_an_end_that_is_known_stays_known() -> None:
     assert Record("dataflow-finished") in actions
 
 
-def live(
-    *events: life.Event, nodes: tuple[str, ...] = ("a", "b")
-) -> tuple[Cell, list[Do | Record]]:
+def live(*events: life.Event, nodes: tuple[str, ...] = ("a", "b")) -> tuple[Cell, list[Action]]:
     now = Cell(2 * SECOND, 0, {n: NodeStatus() for n in nodes})
-    done: list[Do | Record] = []
+    done: list[Action] = []
     for event in events:
         now, actions = step(now, event)
         done += [action for action in actions if not isinstance(action, Deadline)]

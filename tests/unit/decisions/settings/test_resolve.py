@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.cell.owes import Owed
+from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
 from dora_systemd.decisions.settings.machines import Declared
@@ -216,6 +217,8 @@ def test_values_and_back(data: st.DataObject) -> None:
         "env_file": st.lists(texts).map(tuple),
         "property": st.lists(texts).map(tuple),
         "grace_duration": st.integers(0, 2**64 - 1),
+        "stop_limit": st.integers(0, 2**60),
+        "stop": st.builds(NodeStop, st.just(""), st.integers(1, 2**60), st.just(("arm", "cam"))),
         "owes": st.just((Owed("cam", "image", 2 * SECOND),)) | st.just(()),
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))

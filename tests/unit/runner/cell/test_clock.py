@@ -7,6 +7,7 @@ import time
 import pytest
 
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.life.stop_budget import (
     LEAVE_TIMEOUT,
     runner_timeout,
@@ -17,28 +18,37 @@ from dora_systemd.decisions.unit.properties import stop_properties
 from dora_systemd.runner.cell.clock import BACKLOG_SECONDS, STOP_SECONDS, Keepalive, StopClock
 from dora_systemd.values import INFINITY, SECOND
 
+OPTIONS = RunnerOptions("r", "u", "/f.yml", "/", "/dora")
+
 
 class Clock(StopClock):
     """It is as late as the test says."""
 
     def __init__(self, grace: int) -> None:
         self.at = 100.0
-        super().__init__(grace, lambda: self.at)
+        super().__init__(OPTIONS._replace(grace=grace), lambda: self.at)
 
 
 @pytest.mark.parametrize("grace", [0, SECOND, 10 * SECOND, 3600 * SECOND])
 def test_the_parts_fit_the_whole(grace: int) -> None:
-    options = RunnerOptions("r", "u", "/f.yml", "/", "/dora", grace=grace)
+    options = OPTIONS._replace(grace=grace)
     whole = stop_properties(options)["TimeoutStopSec"].value
     # All that the states of the table may take; the rest is journald's.
     states = stop_timeout(grace) + LEAVE_TIMEOUT
-    assert states + 3 * SECOND <= runner_timeout(grace) < whole
+    assert states + 3 * SECOND <= runner_timeout(options) < whole
+
+
+def test_a_stop_with_times_of_nodes_has_the_limit_in_the_place_of_the_grace_duration() -> None:
+    options = OPTIONS._replace(stops=(NodeStop("recorder", 60 * SECOND),), stop_limit=200 * SECOND)
+    assert stop_properties(options)["TimeoutStopSec"].value == 210 * SECOND
+    assert runner_timeout(options) == 209 * SECOND
 
 
 @pytest.mark.parametrize("grace", [INFINITY, INFINITY - 1, INFINITY // 3 * 2])
 def test_the_longest_times_are_infinite(grace: int) -> None:
-    assert unit_timeout(grace) == INFINITY  # D-Bus has 64 bits
-    assert runner_timeout(grace) == INFINITY
+    options = OPTIONS._replace(grace=grace)
+    assert unit_timeout(options) == INFINITY  # D-Bus has 64 bits
+    assert runner_timeout(options) == INFINITY
 
 
 @pytest.mark.parametrize("late", [0.0, 17.0, 22.0, 60.0])
@@ -46,7 +56,7 @@ def test_no_part_gets_more_than_what_is_left(late: float) -> None:
     clock = Clock(10 * SECOND)
     clock.begin("SIGTERM")
     clock.at += late
-    end = 100.0 + runner_timeout(10 * SECOND) / SECOND
+    end = 100.0 + runner_timeout(OPTIONS) / SECOND
     left = clock.for_journal()
     while left() > 0:
         assert clock.at + left() <= end

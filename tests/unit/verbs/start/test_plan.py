@@ -226,6 +226,7 @@ ROOT_ONLY = {
     "realtime": "20",
     "cpu_weight": "10000",
     "io_weight": "10000",
+    "stop_limit": "1h",
     "machines": "{gpu: {host: gpu-box}}",
 }
 
