@@ -29,6 +29,12 @@ NO_KERNEL = "not vm and not emulator"
 # Containers at the same time. Most of the time of a test is waiting, and one more than three makes
 # two cores so busy that the tests wait for each other.
 CONTAINERS = 3
+# Unit tests that need mandoc, fish or zsh, which the lab has.
+WITH_TOOLS = (
+    "tests/unit/cli/test_completions.py",
+    "tests/unit/decisions/dora/test_command.py",
+    "tests/unit/project/test_manpages.py",
+)
 # What `make test` runs on the next Debian: what differs there.
 NEW = "versions or doctor or units or life or newer or account or ordinary"
 # Far more than any test takes: one that hangs fails and shows where, and the others run.
@@ -108,13 +114,16 @@ def unit_step(options: Sequence[str]) -> Step:
 def plan_other_python(_form: str) -> list[Step]:
     """What may differ with the version of Python: whatever touches the system, and all imports.
 
+    Also what needs programs of the lab.
+
     The system tests prove the rest there. Pure decisions are the same everywhere.
     """
     if sys.version_info[:2] == LAB_PYTHON:
         return []
     version = ".".join(map(str, LAB_PYTHON))
     folders = [f"tests/unit/{name}" for name in ("adapters", "gateway", "link", "runner", "trust")]
-    return [lab_step(f"unit tests, Python {version}", "container", folders, minutes=1)]
+    arguments = [*folders, *WITH_TOOLS]
+    return [lab_step(f"unit tests, Python {version}", "container", arguments, minutes=1)]
 
 
 def plan_lab(_form: str) -> list[Step]:

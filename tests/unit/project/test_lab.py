@@ -18,7 +18,7 @@ from lab import cache, definition, initrd, pace, wire
 from lab.changed import find_rooms
 from lab.errors import LabError
 from lab.options import FORMS, parse_options
-from lab.plans import PLANS
+from lab.plans import PLANS, WITH_TOOLS
 from lab.slow import read_speed
 from lab.steps import Result, Step, predecessors, read_summary, run_steps, total, whole_minutes
 
@@ -33,6 +33,18 @@ def test_other_debians_get_what_the_package_asks_for() -> None:
     assert depends is not None
     wanted = set(re.findall(r"python3-\w+", depends[1]))
     assert wanted <= set(definition.PLATFORM_PACKAGES)
+
+
+def test_the_lab_runs_what_is_skipped_without_its_programs() -> None:
+    tests = (definition.CHECKOUT / "tests/unit").rglob("test_*.py")
+    asking = {
+        str(one.relative_to(definition.CHECKOUT))
+        for one in tests
+        if "\nfrom tests.unit.tools import require\n" in one.read_text()
+    }
+    assert asking == set(WITH_TOOLS)
+    (step,) = PLANS["other-python"]("container") or [None]
+    assert step is None or asking <= set(step.command)
 
 
 def test_options_of_run() -> None:
