@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from lab import definition
-from lab.cache import KEEP, take_lock
+from lab.cache import take_lock
 from lab.errors import Stage
 from lab.process import run_logged
 
+KEEP_VENVS = 10
+"""Each checkout has a venv, and several can be at work at the same time."""
 # They need a compiler and libsystemd; unit tests never import them.
 COMPILED = ("pystemd", "systemd-python")
 
@@ -101,7 +103,7 @@ def write_package(venv: Path) -> Path:
 def remove_old(cache: Path, venv: Path) -> None:
     found = [path for path in cache.glob("venv-*") if path != venv]
     found.sort(key=lambda path: path.stat().st_mtime, reverse=True)
-    for path in found[KEEP - 1 :]:
+    for path in found[KEEP_VENVS - 1 :]:
         shutil.rmtree(path)
 
 
