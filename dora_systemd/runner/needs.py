@@ -90,6 +90,7 @@ _LOOK_SECONDS = 2.0
 _PAUSE_SECONDS = 0.05
 """Shortest time between two checks: a directory such as /tmp may change all the time."""
 _AGAIN = "plugged in again"
+_FAILED = ("failed", "restarting")
 _STATES = (State.WAITING, State.RUNNING)
 
 Spawn = Callable[[str, Coroutine[Any, Any, None]], None]
@@ -103,7 +104,7 @@ def wait_for_needs(run: Run, options: RunnerOptions, definition: Definition, spa
     """
     needs = Needs(run, options, definition, spawn)
     spawn("wait for what nodes need", needs.work())
-    spawn("see whether failed nodes lack something", needs.latch())
+    spawn("see whether failed nodes lack something", needs.follow())
 
 
 class Needs:
@@ -118,24 +119,31 @@ class Needs:
         self._passed: dict[str, list[Presence]] = {}
         self._losing: set[str] = set()
         self._closed: set[str] = set()
+        self._down: set[tuple[str, int]] = set()
 
         every = {one.what for one in options.needs}
         self._paths = {one for one in every if not one.startswith(NET)}
         self._watch = Watch(has_links=every != self._paths)
 
-    async def latch(self) -> None:
-        """Close the gate of a node without restarts that has failed, until it is clear why."""
+    async def follow(self) -> None:
+        """Check the needs again when a node has failed: dora would use up its restarts.
+
+        The gate of a node without restarts is closed until it is clear why it has failed.
+        """
         pump = self._run.pump
-        while await pump.wait(lambda cell: bool(self._latched(cell)), None):
-            for node in self._latched(pump.cell):
-                self._run.nodes.gates.close(node)
-                self._closed.add(node)
+        while await pump.wait(lambda cell: self._failed(cell) != self._down, None):
+            self._down = self._failed(pump.cell)
+            for node, _ in self._down:
+                one = pump.cell.nodes[node]
+                if one.policy == LATCHED and one.state == "failed" and node not in self._closed:
+                    self._run.nodes.gates.close(node)
+                    self._closed.add(node)
             self._watch.wake()
 
-    def _latched(self, cell: Cell) -> set[str]:
+    def _failed(self, cell: Cell) -> set[tuple[str, int]]:
+        """The nodes that have failed, and since when."""
         nodes = ((node, cell.nodes[node]) for node in self._needs.keys() & cell.nodes.keys())
-        down = {node for node, one in nodes if one.policy == LATCHED and one.state == "failed"}
-        return down - self._closed
+        return {(node, one.since_us) for node, one in nodes if one.state in _FAILED}
 
     async def work(self) -> None:
         """Check the needs, and act, until the run ends."""
@@ -156,12 +164,15 @@ class Needs:
         if cell.state not in _STATES:
             return
         missing = {node: self._missing(node, seen) for node, seen in found.items()}
-        gates, is_running = self._run.nodes.gates, cell.state is State.RUNNING
+        is_running = cell.state is State.RUNNING
         # A requested stop of a node closes its gate, too.
-        passed = frozenset(filter(gates.is_passing, self._passed))
+        passed = frozenset(one for one in self._passed if self._is_through(one))
         for step in list(need_steps(cell.nodes, missing, is_running, passed)):
             if step.node not in self._losing and not self._run.lock.locked():
                 self._take(step, found[step.node])
+
+    def _is_through(self, node: str) -> bool:
+        return node in self._closed or self._run.nodes.gates.is_passing(node)
 
     def _missing(self, node: str, seen: list[Presence]) -> str:
         pairs = zip(self._needs[node], seen, strict=True)

@@ -203,7 +203,8 @@ def _met(nodes: NodeTable, event: life.NodeMet) -> Change:
     old = nodes.get(event.node, NodeStatus())
     if old.state != "waiting":
         return nodes, None
-    nodes = _set(nodes, event.node, event.at_us, state="starting", needs="")
+    # Dora counts the restarts of the process that waited from zero.
+    nodes = _set(nodes, event.node, event.at_us, state="starting", needs="", restarts=0)
     after = format_duration(max(event.at_us - old.since_us, 0) // SECOND * SECOND)
     return nodes, Record("node-needs-met", event.node, {"reason": f"after {after}"})
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Cell, Project
+from tests.system.cells import Cell, Project, wait_for
 from tests.system.needs.scene import fragile, node_of, seen, wait_running, wait_waiting, with_needs
 
 
@@ -51,14 +51,32 @@ def test_a_stop_ends_a_waiting_node_at_once(cell: Cell, project: Project, place:
 
 
 @pytest.mark.warns("driver crashed", "the device is gone", "ExitCode(1)", "exited with code 1")
-def test_a_driver_that_ends_by_itself_waits_too(cell: Cell, project: Project, place: Path) -> None:
+@pytest.mark.parametrize(("policy", "kept"), [("no", "latched"), ("on-failure", "on-failure")])
+def test_a_driver_that_ends_by_itself_waits_too(
+    cell: Cell, project: Project, place: Path, policy: str, kept: str
+) -> None:
     device = place / "ttyUSB0"
     device.touch()
-    cell.start(fragile(project, device))
+    cell.start(fragile(project, device), "--restart-policy", policy)
     sink = cell.status.nodes["sink"].pid
-    device.unlink()
-    wait_waiting(cell, "driver", device)
+    for _ in range(3):
+        device.unlink()
+        wait_waiting(cell, "driver", device)
+        device.touch()
+        wait_running(cell)
+        assert cell.status.nodes["sink"].pid == sink
+        driver = cell.status.nodes["driver"]
+        assert (driver.policy, driver.restarts) == (kept, 0)
+
+
+@pytest.mark.warns("driver crashed", "ExitCode(1)", "essential node driver", "Failed with result")
+def test_a_driver_that_fails_beside_its_device_is_given_up(
+    cell: Cell, project: Project, place: Path
+) -> None:
+    device = place / "ttyUSB0"
     device.touch()
-    wait_running(cell)
-    assert cell.status.nodes["sink"].pid == sink
-    assert cell.status.nodes["driver"].policy == "latched"
+    path = fragile(project, device)
+    project.write("driver.py", "from dora import Node\nnext(iter(Node()))\nraise SystemExit(1)\n")
+    cell.start(path)
+    wait_for("the essential node ends all", lambda: cell.show("ActiveState") == "failed")
+    assert "node driver: exit code 1" in cell.doractl("why", cell.name).stdout

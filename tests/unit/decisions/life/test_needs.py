@@ -51,6 +51,13 @@ def test_unplugged_and_plugged_in_again() -> None:
     assert (stage(cell), cell.nodes["camera"].needs) == ("running", "")
 
 
+def test_a_node_that_was_restarted_before_its_device_was_missed_has_all_restarts() -> None:
+    cell = cell_of(State.RUNNING, camera=CAMERA._replace(policy="on-failure", restarts=2))
+    cell, names = after(cell, life.NodeLacks(2, "camera", GONE), life.NodeMet(3, "camera"))
+    assert (cell.nodes["camera"].restarts, cell.nodes["camera"].state) == (0, "starting")
+    assert names == ["node-waiting", "node-needs-met"]
+
+
 def test_a_start_that_waits_for_needs_alone_counts_as_started() -> None:
     waiting = NodeStatus("waiting", 7, needs=GONE)
     busy = cell_of(State.WAITING, camera=waiting, sink=NodeStatus("starting", 8))

@@ -254,13 +254,13 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
     "all is there": (
         WAITS,
         life.NodeMet(65 * SECOND, "a"),
-        RUNS._replace(state="starting", since_us=65 * SECOND),
+        RUNS._replace(state="starting", restarts=0, since_us=65 * SECOND),
         (Record("node-needs-met", "a", {"reason": "after 1min 4s"}),),
     ),
     "all is there at once": (
         WAITS,
         life.NodeMet(10, "a"),
-        RUNS._replace(state="starting", since_us=10),
+        RUNS._replace(state="starting", restarts=0, since_us=10),
         (Record("node-needs-met", "a", {"reason": "after 0"}),),
     ),
     "nothing was missing": (RUNS, life.NodeMet(20, "a"), RUNS, ()),
