@@ -26,6 +26,7 @@ from dora_systemd.adapters.runner_socket.listener import serve
 from dora_systemd.decisions.cell.environment import with_changes
 from dora_systemd.decisions.cell.launch import kinds
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
+from dora_systemd.decisions.cell.stops import named_stops
 from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
@@ -233,6 +234,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         table = initial_nodes(
             kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
         )
+        stops = named_stops(options.by_node("stop"))
         cell = Cell(
             *(options.grace, started_us, table),
             downstream=downstream_of(prepared.dataflow),
@@ -240,12 +242,12 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             is_trial=reloader.before is not None,
             notice=reloader.notice,
             is_attached=options.attached,
-            stops={one.node: one for one in options.stops},
-            stop_limit=options.stop_limit,
+            stops=stops,
+            stop_limit=options.of_dataflow("stop_limit") if stops else 0,
         )
         pump = Pump(role.cell(cell), runs.this_life, runs.paths, runs.nodes, runs.pipes)
         dialogue = role.dialogue(options, pump, dora, runs.nodes, runs.pipes)
-        if own.stops:
+        if stops:
             from dora_systemd.runner.cell.node_stops import NodeStops
 
             pump.on_node = NodeStops(pump, dora, runs.nodes, dialogue).perform

@@ -223,7 +223,8 @@ def _stop_outcome(
 def _killed(scope: Scope, cell: Cell, begin: int) -> str:
     """The nodes that had to be killed since then. Only a slow stop needs the journal."""
     options = cell.options
-    delay = min([kill_delay(options.grace), *(one.within for one in options.stops if one.within)])
+    stops = options.by_node("stop")
+    delay = min([kill_delay(options.grace), *(one.within for one in stops.values() if one.within)])
     if time.time_ns() // _MICROSECOND_NS - begin < delay:
         return ""
     # Imported late: most stops are fast.
@@ -232,7 +233,7 @@ def _killed(scope: Scope, cell: Cell, begin: int) -> str:
     nodes = []
     with suppress(DoraSystemdError):
         nodes = JournalReader().killed_since(scope, cell.name, cell.uuid, begin)
-    after = "their time" if options.stops else format_duration(delay)
+    after = "their time" if stops else format_duration(delay)
     return f"killed after {after}: {', '.join(nodes)}" if nodes else ""
 
 

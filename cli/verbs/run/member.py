@@ -17,6 +17,7 @@ from dora_systemd.decisions.machines.key import ORIGINAL, forced_words
 from dora_systemd.decisions.machines.link_command import RESTRICTED
 from dora_systemd.decisions.machines.push import PLACE, format_place
 from dora_systemd.decisions.machines.wire import Refused
+from dora_systemd.decisions.settings.resolve import SET
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
@@ -89,6 +90,12 @@ def _print_place(ctx: click.Context, param: click.Parameter, value: str | None) 
     multiple=True,
     metavar="ADDRESS",
     help="With link: direct, the address of each machine; that of this one first.",
+)
+@click.option(
+    f"--{SET}",
+    multiple=True,
+    metavar="[NODE:]KEY=TEXT",
+    help="A setting of the head for the runner here; without NODE for all nodes.",
 )
 @click.option(
     RESTRICTED,

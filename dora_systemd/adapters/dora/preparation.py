@@ -22,7 +22,6 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import check_owes
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
 from dora_systemd.decisions.cell.rights import check_rights_nodes
-from dora_systemd.decisions.cell.stops import check_stops
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
     Dataflow,
@@ -97,9 +96,11 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     check_restart_nodes(options.node_restarts, ids)
     launched = {node.id for node in dataflow.nodes if has_launcher(node)}
     check_rights_nodes(options.node_rights, ids, launched)
-    is_apart = bool(options.placed)
-    check_stops(options.stops, options.stop_limit, options.grace, ids, is_apart)
     check_owes(options.owes, dict(options.node_restarts), dataflow.nodes)
+    if options.settings:
+        from dora_systemd.decisions.settings.runner import check_settings
+
+        check_settings(options, dataflow.nodes)
 
 
 def resolved(options: RunnerOptions) -> RunnerOptions:

@@ -1,13 +1,14 @@
 """Environment variables of a dataflow: parses `KEY=VALUE` from flags and files, and checks them."""
 
+import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePath
 
 from dora_systemd.decisions.cell import line_rates
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
-from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, parse_setting
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_readable
 from dora_systemd.paths import CellPaths
@@ -21,6 +22,8 @@ _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 LOCK_VARIABLE = "DORA_INHIBIT_LOCK"
 """Variable of the nodes with the path of the file that they lock to inhibit restarts."""
+SET_VARIABLE = "DORA_SYSTEMD_SET"
+"""Passes settings that `doractl set` has changed to the next runner: a JSON list of texts."""
 MANAGER_VARIABLES = frozenset(
     {
         *("NOTIFY_SOCKET", "JOURNAL_STREAM", "INVOCATION_ID", "SYSTEMD_EXEC_PID", "MAINPID"),
@@ -28,6 +31,7 @@ MANAGER_VARIABLES = frozenset(
         *("LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "LISTEN_PIDFDID", "FDSTORE"),
         *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGES_VARIABLE, CHANGE_VARIABLE),
         line_rates.CHANGES_VARIABLE,
+        SET_VARIABLE,
         LOCK_VARIABLE,
     }
 )
@@ -68,7 +72,21 @@ def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> Runn
         node_limits=limits,
         log_rates={**options.log_rates, **rates},
         reload=options.reload._replace(is_on=is_on),
+        settings=changed(options.settings, changes_of(environment)),
     )
+
+
+def changes_of(environment: Mapping[str, str]) -> tuple[SettingText, ...]:
+    """The settings that `doractl set` has changed. Raises DoraSystemdError, ValueError."""
+    return tuple(map(parse_setting, json.loads(environment.get(SET_VARIABLE) or "[]")))
+
+
+def changed(
+    settings: Sequence[SettingText], changes: Sequence[SettingText]
+) -> tuple[SettingText, ...]:
+    """The settings, with all texts of those that `changes` has replaced."""
+    gone = {one[:2] for one in changes}
+    return (*(one for one in settings if one[:2] not in gone), *changes)
 
 
 def parse_assignment(text: str) -> tuple[str, str]:

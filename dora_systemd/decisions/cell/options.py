@@ -38,13 +38,26 @@ from dora_systemd.values import (
 if TYPE_CHECKING:  # few dataflows have any, and `list` loads this module
     from dora_systemd.decisions.cell.owes import Owed
     from dora_systemd.decisions.cell.rights import NodeRights
-    from dora_systemd.decisions.cell.stops import NodeStop
 
 RUNNER_MODULE = "dora_systemd.runner"
 DEFAULT_GRACE = 10 * SECOND
-DEFAULT_STOP_LIMIT = 300 * SECOND
-"""µs, both."""
+"""µs."""
 _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
+
+
+MODULES = {
+    "stop": "stops",
+    "stop_limit": "stops",
+}
+"""By key of each setting that a runner receives as text, its module in decisions/settings/."""
+
+
+class SettingText(NamedTuple):
+    """A value of a setting as text, or one of several for a repeatable kind."""
+
+    node: str  # "" for the dataflow
+    key: str  # of the settings file
+    text: str  # from Kind.format
 
 
 class RunnerOptions(NamedTuple):
@@ -76,10 +89,9 @@ class RunnerOptions(NamedTuple):
     # nodes with a notify socket, see dora_systemd.decisions.watchdog.watchdogs
     watchdogs: Mapping[str, int] = {}
     node_rights: "tuple[NodeRights, ...]" = ()
-    stops: "tuple[NodeStop, ...]" = ()  # of single nodes
-    stop_limit: int = DEFAULT_STOP_LIMIT  # µs for a stop, if there are `stops`
     owes: "tuple[Owed, ...]" = ()  # outputs of nodes that have to come in time
     needs: tuple[NodeNeed, ...] = ()  # paths and interfaces that single nodes wait for
+    settings: tuple[SettingText, ...] = ()  # see dora_systemd.decisions.settings
     placed: tuple[Placed, ...] = ()  # the nodes that run on other machines than the head
     # machine, head: on a member its name, and the host name of the head; else ""
     machine: str = ""
@@ -93,6 +105,45 @@ class RunnerOptions(NamedTuple):
     def hot_reload(self) -> bool:
         """Whether files are watched."""
         return self.reload.is_on
+
+    def has(self, key: str) -> bool:
+        """Whether the dataflow or a node has a value of the setting."""
+        assert key in MODULES
+        return any(one.key == key for one in self.settings)
+
+    def of_dataflow(self, key: str) -> Any:
+        """The value of the setting for the dataflow, or its default.
+
+        Raises DoraSystemdError for a text that is no value, as the next ones do.
+        """
+        setting = runner_setting(key)
+        texts = [one.text for one in self.settings if one[:2] == ("", key)]
+        return setting.read(texts) if texts else setting.default
+
+    def by_node(self, key: str) -> dict[str, Any]:
+        """The values that single nodes have of the setting, by node."""
+        assert key in MODULES
+        texts: dict[str, list[str]] = {}
+        for one in self.settings:
+            if one.node and one.key == key:
+                texts.setdefault(one.node, []).append(one.text)
+        return {node: runner_setting(key).read(own) for node, own in texts.items()}
+
+    def of_node(self, node: str, key: str) -> Any:
+        """The value that a node has of the setting, or that of the dataflow."""
+        own = self.by_node(key)
+        return own[node] if node in own else self.of_dataflow(key)
+
+
+def runner_setting(key: str) -> Any:
+    """The Setting, whose module is imported with its first value, because few dataflows have one.
+
+    Raises DoraSystemdError (USAGE) for a key that no runner has.
+    """
+    if key not in MODULES:
+        raise _refusal(f"unknown setting {quoted(key)}")
+    module = import_module(f"dora_systemd.decisions.settings.{MODULES[key]}")
+    return module.RUNNER_SETTINGS[key]
 
 
 Parse = Callable[[str], Any]
@@ -143,14 +194,25 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
 _parse_rights = _late("cell.rights", "parse_node_rights")
 _format_rights = _late("cell.rights", "format_node_rights")
 _parse_owed, _format_owed = (_late("cell.owes", name) for name in ("parse_owed", "format_owed"))
-_parse_stop, _format_stop = (
-    _late("cell.stops", name) for name in ("parse_node_stop", "format_node_stop")
-)
 _parse_watchdogs = _late("watchdog.watchdogs", "parse_sockets")
 
 
 def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
     return _late("watchdog.watchdogs", "format_watchdogs")(watchdogs) if watchdogs else []
+
+
+def parse_setting(text: str) -> SettingText:
+    """Parse [NODE:]KEY=TEXT, the inverse of format_setting. Raises DoraSystemdError (USAGE)."""
+    place, equals, value = text.partition("=")
+    node, _, key = place.rpartition(":")
+    if not equals or not key.isidentifier():
+        raise _refusal(f"{quoted(text)} is not [NODE:]KEY=TEXT")
+    return SettingText(node, key, value)
+
+
+def format_setting(given: SettingText) -> str:
+    """Format as [NODE:]KEY=TEXT."""
+    return f"{given.node}:{given.key}={given.text}" if given.node else f"{given.key}={given.text}"
 
 
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
@@ -170,10 +232,9 @@ _OPTIONS = (
     _each("node-rights", "node_rights", _parse_rights, _format_rights),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
     _each("owes", "owes", _parse_owed, _format_owed),
-    _each("stop", "stops", _parse_stop, _format_stop),
-    _unless_default("stop-limit", "stop_limit", parse_duration, format_duration),
     Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("needs", "needs", parse_node_need, "=".join),
+    _each("set", "settings", parse_setting, format_setting),
     _each("placed", "placed", parse_placed, "=".join),
     _unless_default("machine", "machine", parse_machine),
     _unless_default("head", "head", parse_head),

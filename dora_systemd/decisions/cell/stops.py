@@ -1,10 +1,9 @@
 """How single nodes stop: the time of each, and which nodes stop before it.
 
-This is part of the runner's command line, which `list` parses: it imports this module for a
-dataflow that has some.
+The setting is in decisions/settings/stops.py.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 
@@ -26,6 +25,11 @@ class NodeStop(NamedTuple):
 
 Stops = Mapping[str, NodeStop]
 """By node."""
+
+
+def named_stops(stops: Mapping[str, NodeStop]) -> Stops:
+    """The stops, with the node in each."""
+    return {node: stop._replace(node=node) for node, stop in stops.items()}
 
 
 def parse_node_stop(text: str) -> NodeStop:
@@ -119,7 +123,7 @@ def total(stops: Stops, grace: int) -> int:
 
 
 def check_stops(
-    stops: Sequence[NodeStop], limit: int, grace: int, nodes: Iterable[str], machines: bool
+    stops: Collection[NodeStop], limit: int, grace: int, nodes: Iterable[str], machines: bool
 ) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a stop that no dataflow of these `nodes` can have.
 
@@ -128,11 +132,12 @@ def check_stops(
     if not stops:
         return
     known, by_node = list(nodes), {one.node: one for one in stops}
-    check_known("cannot set the stop of", by_node, known)
     for one in stops:
         check_known(f"cannot stop {one.node} after", one.after, known)
     if machines:
-        message = f"cannot set the stop of the node {stops[0].node}: the dataflow has machines"
+        message = (
+            f"cannot set the stop of the node {next(iter(by_node))}: the dataflow has machines"
+        )
         raise _impossible(message, "remove stop:, which works on one machine only")
     _check_order(by_node)
     _check_time(by_node, limit, grace)

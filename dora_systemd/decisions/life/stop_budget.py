@@ -32,7 +32,10 @@ def stop_timeout(grace: int) -> int:
 
 def nodes_timeout(options: RunnerOptions) -> int:
     """The time after which the last node is killed."""
-    return options.stop_limit if options.stops else kill_delay(options.grace)
+    if options.has("stop"):
+        limit: int = options.of_dataflow("stop_limit")
+        return limit
+    return kill_delay(options.grace)
 
 
 def unit_timeout(options: RunnerOptions) -> int:

@@ -10,14 +10,19 @@ from pathlib import PurePath
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.line_rates import ALL_NODES, RateLimits
-from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.options import (
+    RunnerOptions,
+    SettingText,
+    format_setting,
+    runner_setting,
+)
 from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.machines.entry import Machine
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.owes import NOTIFY, WATCHDOG
-from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.decisions.settings.resolve import SET, Settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.sandbox import SANDBOX
 from dora_systemd.decisions.settings.table import (
@@ -62,6 +67,11 @@ def on_head(options: RunnerOptions) -> RunnerOptions:
         node_rights=tuple(_on_head(options.node_rights, away)),
         log_rates={key: one for key, one in options.log_rates.items() if key not in away},
         watchdogs=_without(options.watchdogs, away),
+        settings=tuple(
+            one
+            for one in options.settings
+            if one.node not in away or runner_setting(one.key).only_head
+        ),
     )
 
 
@@ -114,6 +124,7 @@ def _words(
     yield from (f"--placed={'='.join(one)}" for one in options.placed)
     yield from (f"--address={one}" for one in _own_first(options.addresses, machine.address))
     nodes = [one.node for one in options.placed if one.machine == machine.name]
+    yield from (f"--{SET}={format_setting(one)}" for one in _passed_on(options.settings, nodes))
     given = [(one, settings[one]) for one in _SHARED if settings.is_given(one)]
     given += _of_nodes(options, nodes)
     if settings[WORKING_DIRECTORY] is not None:
@@ -124,6 +135,15 @@ def _words(
     kept = {one.name: (one, value) for one, value in given}
     for setting, value in {**kept, **own}.values():
         yield from _flags(setting, value)
+
+
+def _passed_on(settings: Sequence[SettingText], nodes: Sequence[str]) -> Iterator[SettingText]:
+    """The settings of `nodes`, and those for all nodes."""
+    for one in settings:
+        setting = runner_setting(one.key)
+        is_for_them = one.node in nodes or (not one.node and setting.per_node)
+        if is_for_them and not setting.only_head:
+            yield one
 
 
 def _own_first(addresses: Sequence[str], own: str) -> list[str]:

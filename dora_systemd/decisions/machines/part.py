@@ -30,6 +30,9 @@ def own_options(options: RunnerOptions) -> RunnerOptions:
         node_limits=tuple(one for one in options.node_limits if is_here(options, one.node)),
         node_rights=tuple(one for one in options.node_rights if is_here(options, one.node)),
         needs=tuple(one for one in options.needs if is_here(options, one.node)),
+        settings=tuple(
+            one for one in options.settings if not one.node or is_here(options, one.node)
+        ),
         watchdogs={node: one for node, one in options.watchdogs.items() if is_here(options, node)},
     )
 

@@ -12,6 +12,8 @@ from dora_systemd.decisions.cell.environment import (
     parse_assignment,
 )
 from dora_systemd.decisions.cell.line_rates import format_rates, parse_rates
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import (
     format_bool,
@@ -69,6 +71,10 @@ class Setting(Generic[T]):
     # whether a value, of a node or of the dataflow, gives more than the user of the dataflow has.
     # In system scope such a value is only valid where root_only settings are.
     raises: Callable[[Any], bool] | None = None
+    only_head: bool = False  # on several machines the head obeys it, also for nodes of the others
+    # raises DoraSystemdError (BAD_INPUT) for values in the options of a runner that these nodes of
+    # the dataflow cannot have
+    check: Callable[[RunnerOptions, Sequence[Node]], None] | None = None
 
     def __post_init__(self) -> None:
         word = self.name.replace("_", "-")
@@ -79,6 +85,11 @@ class Setting(Generic[T]):
         object.__setattr__(self, "flags", self.flags or (f"--{word}",))
         object.__setattr__(self, "variable", self.variable or variable)
         object.__setattr__(self, "metavar", self.metavar or self.kind.metavar)
+
+    def read(self, texts: Sequence[str]) -> T:
+        """The value that Kind.format has made `texts` of. Raises DoraSystemdError."""
+        value: T = self.kind.parse(list(texts) if self.kind.is_repeatable else texts[-1], None)
+        return value
 
 
 def listed(value: Any) -> Sequence[Any]:

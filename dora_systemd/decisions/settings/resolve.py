@@ -13,21 +13,21 @@ from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_limits, node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
 from dora_systemd.decisions.cell.needs import split_needs
-from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.options import MODULES, RunnerOptions, SettingText, parse_setting
 from dora_systemd.decisions.cell.owes import RESTART, base_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
 from dora_systemd.decisions.cell.rights import BY_KEY as RIGHTS
 from dora_systemd.decisions.cell.rights import NodeRights, merge_node_rights
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
-from dora_systemd.decisions.settings.kinds import Base, Setting
+from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.owes import NOTIFY, OWES, WATCHDOG, owes_of
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
-from dora_systemd.decisions.settings.stops import STOP, STOP_LIMIT, stops_of
+from dora_systemd.decisions.settings.stops import STOP
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
     DEBUG,
@@ -46,6 +46,8 @@ Given = tuple[str, Any]
 """A source's name for messages, and its value."""
 
 DEFAULT_SOURCE = "default"
+SET = "set"
+"""The flag by which a head passes settings to its members, `--set [NODE:]KEY=TEXT`."""
 
 MAX_JSON = 1024 * 1024
 """Maximum bytes of a settings file with anchors expanded."""
@@ -95,6 +97,7 @@ def resolve_settings(
     precedence last. Raises DoraSystemdError: USAGE for flags and variables, BAD_INPUT for files.
     """
     documents = [(source, check_document(source, document, table)) for source, document in files]
+    texts = [parse_setting(text) for text in texts_of(flags.get(SET) or ())]
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for setting in table:
@@ -102,9 +105,12 @@ def resolve_settings(
             *_from_files(setting, reversed(documents)),
             *_from_variable(setting, environment),
             *_from_flag(setting, flags),
+            *_from_texts(setting, [one.text for one in texts if one[:2] == ("", setting.name)]),
         ]
         sources[setting.name], values[setting.name] = _merged(setting, given)
-    return Settings(values, sources, _resolve_nodes(documents, table), table)
+    nodes = _resolve_nodes(documents, table)
+    _add_texts(nodes, texts, table)
+    return Settings(values, sources, nodes, table)
 
 
 def given_texts(
@@ -170,6 +176,11 @@ def _from_variable(
         yield setting.variable, _parsed(setting, value, setting.variable, base)
 
 
+def _from_texts(setting: Setting[Any], texts: Sequence[str]) -> Iterator[Given]:
+    if texts:
+        yield f"--{SET}", setting.read(texts)
+
+
 def _from_files(
     setting: Setting[Any], documents: Iterable[tuple[str, Mapping[str, Any]]]
 ) -> Iterator[Given]:
@@ -220,6 +231,16 @@ def _resolve_nodes(
     return nodes
 
 
+def _add_texts(
+    nodes: dict[str, dict[str, Any]], texts: Sequence[SettingText], table: Sequence[Setting[Any]]
+) -> None:
+    """Replace values in `nodes` by those of --set."""
+    for setting in table:
+        for node in dict.fromkeys(one.node for one in texts if one.node):
+            if own := [one.text for one in texts if one[:2] == (node, setting.name)]:
+                nodes.setdefault(node, {})[setting.name] = setting.read(own)
+
+
 _FIELDS = {
     setting.name: field
     for setting, field in zip(POLICY_SETTINGS, RestartPolicy._fields, strict=True)
@@ -240,13 +261,21 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
-        stops=stops_of(settings.by_node(STOP)),
-        stop_limit=settings[STOP_LIMIT],
         watchdogs=watchdogs(settings),
         needs=split_needs(settings[NEEDS], settings.by_node(NEEDS))[1],
         reload=hot_reload(settings, options.working_directory),
         owes=owes_of(settings.by_node(OWES), settings[OWES]),
+        settings=tuple(runner_texts(settings)),
     )
+
+
+def runner_texts(settings: Settings) -> Iterator[SettingText]:
+    """The settings that the runner receives as text, as far as they are given."""
+    for setting in settings.table:
+        if setting.name in MODULES:
+            given = {"": settings[setting]} if settings.is_given(setting) else {}
+            for node, value in {**given, **settings.by_node(setting)}.items():
+                yield from (SettingText(node, setting.name, t) for t in setting.kind.format(value))
 
 
 def log_rates(settings: Settings) -> RateLimits:
@@ -260,7 +289,7 @@ def log_rates(settings: Settings) -> RateLimits:
 def watchdogs(settings: Settings) -> Watchdogs:
     """Which nodes have a watchdog or a notify socket. Raises DoraSystemdError (BAD_INPUT)."""
     # A node with a time to stop can extend it.
-    timed = {one.node: True for one in stops_of(settings.by_node(STOP)) if one.within}
+    timed = {node: True for node, one in settings.by_node(STOP).items() if one and one.within}
     sockets = {ALL_NODES: settings[NOTIFY], **timed, **settings.by_node(NOTIFY)}
     return merge_watchdogs(settings.by_node(WATCHDOG), settings[WATCHDOG], sockets)
 

@@ -1,13 +1,24 @@
 """The settings of a stop: the time and the order of nodes, and the limit of all together."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from dora_systemd.decisions.cell.options import DEFAULT_STOP_LIMIT
-from dora_systemd.decisions.cell.stops import NodeStop, format_node_stop, parse_node_stop, stop_of
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.stops import (
+    NodeStop,
+    check_stops,
+    format_node_stop,
+    named_stops,
+    parse_node_stop,
+    stop_of,
+)
+from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.settings.kinds import DURATION, Base, Kind, Scalar, Setting, texts_of
-from dora_systemd.values import scalar_text
+from dora_systemd.values import SECOND, scalar_text
+
+DEFAULT_STOP_LIMIT = 300 * SECOND
+"""µs."""
 
 
 def _parse(value: Any, _: Base) -> NodeStop:
@@ -17,6 +28,12 @@ def _parse(value: Any, _: Base) -> NodeStop:
     return stop_of(
         {key: texts_of(one) if key == "after" else scalar_text(one) for key, one in value.items()}
     )
+
+
+def _check(options: RunnerOptions, nodes: Sequence[Node]) -> None:
+    stops, limit = named_stops(options.by_node("stop")), options.of_dataflow("stop_limit")
+    is_apart = bool(options.placed)
+    check_stops(stops.values(), limit, options.grace, [node.id for node in nodes], is_apart)
 
 
 STOP = Setting[NodeStop | None](
@@ -30,6 +47,7 @@ STOP = Setting[NodeStop | None](
     None,
     "Time that the node has to stop, and the nodes that stop before it.",
     only_nodes=True,
+    check=_check,
 )
 STOP_LIMIT = Setting[int](
     "stop_limit",
@@ -40,7 +58,4 @@ STOP_LIMIT = Setting[int](
 )
 STOP_SETTINGS: tuple[Setting[Any], ...] = (STOP, STOP_LIMIT)
 
-
-def stops_of(nodes: Mapping[str, NodeStop | None]) -> tuple[NodeStop, ...]:
-    """The stops of the nodes that settings files give one."""
-    return tuple(stop._replace(node=node) for node, stop in nodes.items() if stop)
+RUNNER_SETTINGS = {one.name: one for one in STOP_SETTINGS}

@@ -86,7 +86,9 @@ LATE = {
         "decisions.views.outcome": {"decisions.views.objects"},
     },
     "most dataflows owe nothing, wait for nothing, never restarted, and run on one machine": {
-        "adapters.dora.preparation": {"adapters.dora.probe", "decisions.machines.part"},
+        "adapters.dora.preparation": {
+            *("adapters.dora.probe", "decisions.machines.part", "decisions.settings.runner"),
+        },
         "runner.main": {
             *("runner.machines.head", "runner.machines.member", "runner.needs"),
             "runner.cell.node_stops",

@@ -13,7 +13,9 @@ from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.line_rates import ALL_NODES, SHORTEST, RateLimit
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import (
+    MODULES,
     RunnerOptions,
+    SettingText,
     format_runner_argv,
     options_from_command,
     parse_runner_argv,
@@ -23,7 +25,6 @@ from dora_systemd.decisions.cell.owes import SHORTEST as SHORTEST_TIME
 from dora_systemd.decisions.cell.owes import THEN, Owed
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
 from dora_systemd.decisions.cell.rights import parse_node_rights
-from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import limits_of_a_node
@@ -49,12 +50,7 @@ policies = st.builds(
 outputs = st.from_regex(r"[a-z][a-z0-9_/:.-]{0,20}", fullmatch=True)
 spans = st.integers(SHORTEST_TIME, 10**12)
 owed = st.builds(Owed, idents, outputs, spans, spans, st.sampled_from(THEN))
-stops = st.builds(
-    NodeStop,
-    idents,
-    st.integers(0, 10**12),
-    st.lists(idents, min_size=1, unique=True).map(tuple),
-)
+given_settings = st.builds(SettingText, st.just("") | idents, st.sampled_from([*MODULES]), texts)
 options = st.builds(
     RunnerOptions,
     name=st.from_regex(r"[a-z][a-z0-9_-]{0,20}(?<!-)", fullmatch=True).filter(
@@ -69,8 +65,7 @@ options = st.builds(
     debug=st.booleans(),
     allow_shell_nodes=st.booleans(),
     grace=st.integers(0, 2**64 - 1),
-    stops=st.lists(stops).map(tuple),
-    stop_limit=times | st.just(INFINITY),
+    settings=st.lists(given_settings).map(tuple),
     attached=st.booleans(),
     exit_when_nodes_finish=st.none() | st.booleans(),
     env_keys=st.lists(texts).map(tuple),

@@ -6,8 +6,7 @@ import time
 
 import pytest
 
-from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.stops import NodeStop
+from dora_systemd.decisions.cell.options import RunnerOptions, parse_setting
 from dora_systemd.decisions.life.stop_budget import (
     LEAVE_TIMEOUT,
     runner_timeout,
@@ -39,7 +38,8 @@ def test_the_parts_fit_the_whole(grace: int) -> None:
 
 
 def test_a_stop_with_times_of_nodes_has_the_limit_in_the_place_of_the_grace_duration() -> None:
-    options = OPTIONS._replace(stops=(NodeStop("recorder", 60 * SECOND),), stop_limit=200 * SECOND)
+    texts = ("recorder:stop=within=1min", "stop_limit=3min 20s")
+    options = OPTIONS._replace(settings=tuple(map(parse_setting, texts)))
     assert stop_properties(options)["TimeoutStopSec"].value == 210 * SECOND
     assert runner_timeout(options) == 209 * SECOND
 

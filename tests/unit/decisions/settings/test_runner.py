@@ -1,0 +1,141 @@
+"""A setting travels as text: to the runner, to a member, and through `doractl set`."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.cell.environment import SET_VARIABLE, with_changes
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.options import (
+    MODULES,
+    RunnerOptions,
+    SettingText,
+    format_runner_argv,
+    parse_runner_argv,
+    parse_setting,
+    runner_setting,
+)
+from dora_systemd.decisions.cell.stops import NodeStop
+from dora_systemd.decisions.descriptor.nodes import parse_node
+from dora_systemd.decisions.machines.entry import Machine
+from dora_systemd.decisions.machines.member import member_of, on_head
+from dora_systemd.decisions.machines.part import own_options
+from dora_systemd.decisions.remote.hosts import parse_host
+from dora_systemd.decisions.settings.resolve import resolve_settings, with_settings
+from dora_systemd.decisions.settings.runner import check_settings
+from dora_systemd.decisions.settings.table import SETTINGS
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.values import SECOND
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora")
+FILE = {
+    "stop_limit": "200s",
+    "nodes": {"camera": {"stop": "60s"}, "arm": {"stop": {"after": ["camera"]}}},
+}
+NODES = [parse_node({"id": one, "path": f"{one}.py"}, 0, "robot.yml") for one in ("camera", "arm")]
+
+
+def started(document: object = FILE) -> RunnerOptions:
+    """The options of the runner, from its command line."""
+    settings = resolve_settings({}, {}, [("/srv/robot.systemd.yml", document)])
+    return parse_runner_argv(format_runner_argv(with_settings(OPTIONS, settings)))
+
+
+@pytest.mark.parametrize("key", MODULES)
+def test_each_module_has_the_settings_of_the_table(key: str) -> None:
+    assert runner_setting(key) in SETTINGS
+
+
+def test_a_value_of_a_file_reaches_the_runner() -> None:
+    options = started()
+    assert [one for one in format_runner_argv(options) if one.startswith("--set=")] == [
+        "--set=camera:stop=within=1min",
+        "--set=arm:stop=after=camera",
+        "--set=stop_limit=3min 20s",
+    ]
+    assert options.has("stop")
+    assert options.of_dataflow("stop_limit") == 200 * SECOND
+    assert options.of_node("camera", "stop") == NodeStop("", 60 * SECOND)
+    assert options.of_node("sink", "stop") is None
+    assert options.by_node("stop").keys() == {"camera", "arm"}
+
+
+def test_without_a_value_it_has_the_default() -> None:
+    options = started({})
+    assert options.settings == ()
+    assert not options.has("stop")
+    assert options.of_dataflow("stop_limit") == 300 * SECOND
+
+
+@pytest.mark.parametrize("text", ["stop", "camera:stop", "=1", "camera:=1", "a b=1"])
+def test_what_is_no_setting(text: str) -> None:
+    with pytest.raises(DoraSystemdError, match="is not"):
+        parse_setting(text)
+
+
+@pytest.mark.parametrize("words", [["stop=soon"], ["stp=1s"], ["camera:stop=within=soon"]])
+def test_the_runner_refuses_what_it_does_not_know(words: list[str]) -> None:
+    options = OPTIONS._replace(settings=tuple(map(parse_setting, words)))
+    with pytest.raises(DoraSystemdError):
+        check_settings(options, NODES)
+
+
+def test_nodes_have_to_exist() -> None:
+    with pytest.raises(DoraSystemdError, match="cannot set stop of the node 'camra'") as caught:
+        check_settings(started({"nodes": {"camra": {"stop": "1s"}}}), NODES)
+    assert caught.value.hint == "did you mean camera?"
+    check_settings(started(), NODES)
+
+
+def test_a_concern_refuses_more() -> None:
+    with pytest.raises(DoraSystemdError, match="that is a circle"):
+        check_settings(started({"nodes": {"arm": {"stop": {"after": ["arm"]}}}}), NODES)
+
+
+def with_variable(options: RunnerOptions, texts: Any) -> RunnerOptions:
+    return with_changes(options, {SET_VARIABLE: json.dumps(texts)})
+
+
+def test_a_change_takes_the_place_of_the_value() -> None:
+    options = with_variable(started(), ["camera:stop=within=5s", "sink:stop=within=1s"])
+    assert options.of_node("camera", "stop") == NodeStop("", 5 * SECOND)
+    assert options.by_node("stop").keys() == {"camera", "arm", "sink"}
+    assert with_changes(started(), {}) == started()
+
+
+def spread(setting_key: str, text: str) -> tuple[RunnerOptions, list[str], RunnerOptions]:
+    """The head's options, the words for the member `gpu` of the node yolo, and its options."""
+    texts = (SettingText("", setting_key, text), *_of_nodes(setting_key, text))
+    options = OPTIONS._replace(placed=(Placed("yolo", "gpu"),), settings=texts)
+    machine = Machine("gpu", parse_host("gpu-box"), "", {}, (), is_own=True)
+    member = member_of(machine, options, resolve_settings({}, {}, ()), {})
+    words = [one.removeprefix("--set=") for one in member.words if one.startswith("--set=")]
+    settings = resolve_settings({"set": tuple(words)}, {}, [("/srv/robot.systemd.yml", FILE)])
+    there = with_settings(OPTIONS._replace(placed=options.placed, machine="gpu"), settings)
+    return on_head(options), words, own_options(there)
+
+
+def _of_nodes(key: str, text: str) -> tuple[SettingText, ...]:
+    return (SettingText("camera", key, text), SettingText("yolo", key, text))
+
+
+def test_each_machine_gets_the_settings_of_its_nodes() -> None:
+    head, words, there = spread("stop", "within=7s")
+    assert words == ["stop=within=7s", "yolo:stop=within=7s"]
+    assert head.by_node("stop") == {"camera": NodeStop("", 7 * SECOND)}
+    assert there.by_node("stop") == {"yolo": NodeStop("", 7 * SECOND)}
+
+
+def test_what_only_the_head_obeys_stays_there() -> None:
+    setting = runner_setting("stop")
+    module = __import__("dora_systemd.decisions.settings.stops", fromlist=["RUNNER_SETTINGS"])
+    module.RUNNER_SETTINGS["stop"] = replace(setting, only_head=True)
+    try:
+        head, words, _ = spread("stop", "within=7s")
+    finally:
+        module.RUNNER_SETTINGS["stop"] = setting
+    assert words == []
+    assert head.by_node("stop").keys() == {"camera", "yolo"}
