@@ -68,6 +68,8 @@ $ENV{PATH} =~ s/^\Q$libexec\E://;
 unless (exists $ENV{ZENOH_CONFIG} or exists $ENV{DORA_ZENOH_CONFIG_OVERLAY} or not -r $zenoh) {
     $ENV{DORA_ZENOH_CONFIG_OVERLAY} = $zenoh;
 }
+# Python then prints its stack to stderr when a signal such as SIGSEGV ends it: `doractl why` shows it.
+$ENV{PYTHONFAULTHANDLER} = 1 unless exists $ENV{PYTHONFAULTHANDLER};
 if (defined $rights and ($rights =~ /^\Q$node\E (.*)$/m or $rights =~ /^\* (.*)$/m)) {
     unshift @command, split ' ', $1;
 }

@@ -114,9 +114,8 @@ def signs(cell: Cell, node: str) -> int:
 def test_a_node_that_falls_silent_is_restarted(front: Front, cell: Cell, project: Project) -> None:
     others = {name: OTHER.format(line) for name, line in OTHERS.items()}
     flow = project.root / write_flow(project, feeder=FEEDER, **others)
-    environment = ("--env", "PYTHONFAULTHANDLER=1")
     seconds = limit()
-    cell.start(flow, f"--watchdog={seconds}s", *ON_FAILURE, *environment)
+    cell.start(flow, f"--watchdog={seconds}s", *ON_FAILURE)
     said = {
         "feeder": f"[31m{seconds}000000 us",
         "shell": "by a program",

@@ -2,7 +2,9 @@
 
 import ast
 import os
+import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -129,6 +131,7 @@ def test_no_other_variable_is_touched(environment: dict[str, str], tmp_path: Pat
         "PATH": "/usr/bin:/bin",
         "MODEL": "yolo",
         "ZENOH_CONFIG": "z",
+        "PYTHONFAULTHANDLER": "1",
     }
 
 
@@ -169,6 +172,17 @@ def test_zenoh_of_ones_own(
     done = launcher({**environment, key: text}, "kept", str(tmp_path), "keep", "/usr/bin/env")
     said = done.stdout.splitlines()
     assert [one for one in said if one.startswith(("DORA_Z", "ZENOH_"))] == [f"{key}={text}"]
+
+
+@pytest.mark.parametrize("own", [None, "", "0"])
+def test_python_prints_its_stack(
+    environment: dict[str, str], tmp_path: Path, own: str | None
+) -> None:
+    given = environment if own is None else {**environment, "PYTHONFAULTHANDLER": own}
+    crash = ("-c", "import os\ndef read_frame():\n  os.abort()\nread_frame()")
+    done = launcher(given, "kept", str(tmp_path), "keep", sys.executable, *crash)
+    assert done.returncode == -signal.SIGABRT
+    assert ("in read_frame" in done.stderr) == (own != "")
 
 
 def test_output_that_dora_reads_is_left_alone(environment: dict[str, str], tmp_path: Path) -> None:
