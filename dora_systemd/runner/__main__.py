@@ -16,6 +16,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import (
+    allow_core_dumps,
     enter_supervisor,
     leave_out_openssl,
     nodes_environment,
@@ -38,6 +39,8 @@ def begin(argv: list[str]) -> "Begun | None":
     directory = os.environ.get("RUNTIME_DIRECTORY")
     if directory:
         with contextlib.suppress(OSError, DoraSystemdError):
+            with contextlib.suppress(OSError):
+                allow_core_dumps()
             options = parse_runner_argv(argv)
             unit = enter_supervisor()
             paths = CellPaths(Path(directory))

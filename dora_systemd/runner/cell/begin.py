@@ -3,6 +3,7 @@
 import contextlib
 import os
 import pwd
+import resource
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN, keeps_core_dumps
 from dora_systemd.decisions.cell.environment import find_python, node_environment, with_place
 from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -48,6 +50,17 @@ def enter_supervisor() -> Path:
     cgroup.make_group(own / cgroup.SUPERVISOR)
     cgroup.move_process(own / cgroup.SUPERVISOR, 0)
     return own
+
+
+def allow_core_dumps(root: Path = Path("/")) -> None:
+    """Raise the soft limit for core dumps, which is 0 in Debian, if systemd-coredump gets them.
+
+    Otherwise a crash of a node would leave files in the directories of nodes. A hard limit of 0
+    (LimitCORE=0) stays. root: has all files. Raises OSError.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_CORE)
+    if soft == 0 != hard and keeps_core_dumps((root / CORE_PATTERN).read_text(errors="replace")):
+        resource.setrlimit(resource.RLIMIT_CORE, (hard, hard))
 
 
 def nodes_environment(directory: str) -> dict[str, str]:

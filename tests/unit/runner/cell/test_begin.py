@@ -2,6 +2,7 @@
 
 import os
 import pwd
+import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from dora_systemd.adapters.cgroup.groups import SUPERVISOR, group_of
 from dora_systemd.adapters.dora.engine import Child
+from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -179,3 +181,33 @@ def test_a_coordinator_takes_any_port(paths: CellPaths, tmp_path: Path) -> None:
     for _ in range(2):
         end(start_coordinator(dora, paths, {"PATH": os.environ["PATH"]}))
         assert "--port 0" in Path(f"{dora}.coordinator").read_text()
+
+
+PIPED = "|/usr/lib/systemd/systemd-coredump %P %u %g %s %t %c %h %d %F\n"
+
+
+@pytest.mark.parametrize(
+    ("pattern", "limits", "soft"),
+    [
+        (PIPED, (0, 4096), 4096),
+        (PIPED, (0, 0), 0),
+        (PIPED, (1024, 4096), 1024),
+        ("core\n", (0, 4096), 0),
+    ],
+)
+def test_core_dumps_are_for_systemd_only(
+    pattern: str, limits: tuple[int, int], soft: int, tmp_path: Path
+) -> None:
+    (tmp_path / CORE_PATTERN).parent.mkdir(parents=True)
+    (tmp_path / CORE_PATTERN).write_text(pattern)
+    script = (
+        "import pathlib, resource, sys\n"
+        "from dora_systemd.runner.cell.begin import allow_core_dumps\n"
+        f"resource.setrlimit(resource.RLIMIT_CORE, {limits})\n"
+        "allow_core_dumps(pathlib.Path(sys.argv[1]))\n"
+        "print(*resource.getrlimit(resource.RLIMIT_CORE))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == [str(soft), str(limits[1])]
