@@ -22,6 +22,7 @@ from dora_systemd.adapters.host.process_table import read_processes, socket_owne
 from dora_systemd.adapters.host.real_time import read_real_time
 from dora_systemd.adapters.host.unit_files import read_unit_file
 from dora_systemd.adapters.journal import reader as journal_reader
+from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN, core_program
 from dora_systemd.decisions.unit.file import BOOT_TARGET, runner_of
 from dora_systemd.decisions.views.diagnosis import (
     DORA_PORTS,
@@ -53,6 +54,7 @@ from dora_systemd.trust.socket_table import TABLES, listening_sockets
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.reading import slice_group
+from dora_systemd.verbs.facts.stack import read_pattern
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.enable import boot_target
@@ -67,6 +69,9 @@ JOURNALD = "systemd-journald.service"
 _SECONDS = 20.0
 _STARTED = "ExecMainStartTimestamp"
 _JOURNALD_CONFIG = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
+_COREDUMP_CONFIG = ("systemd-analyze", "--no-pager", "cat-config", "systemd/coredump.conf")
+_CONTAINER = "run/systemd/container"
+"""systemd writes the kind of its container to this file, see systemd-detect-virt(1)."""
 _BROKEN = ("bad-setting", "error")
 
 
@@ -259,9 +264,16 @@ def _versions(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
 
 
 def _coredumps(_scope: Scope, root: Path) -> Iterator[Finding]:
-    with suppress(OSError):
-        pattern = (root / "proc/sys/kernel/core_pattern").read_text(errors="replace")
-        yield judge_core_pattern(pattern)
+    if not (root / CORE_PATTERN).exists():
+        return
+    pattern = read_pattern(root)
+    program = core_program(pattern)
+    is_there = not program or exists(_below(root, Path(program)))
+    config = ""
+    if program:
+        with suppress(DoraSystemdError):
+            config = run_command(_COREDUMP_CONFIG, _SECONDS).stdout
+    yield judge_core_pattern(pattern, is_there, config, exists(root / _CONTAINER))
 
 
 def _upgrades(_scope: Scope, root: Path) -> Iterator[Finding]:

@@ -1,10 +1,12 @@
 """`doractl why`: collects what systemd, the journal and the runner know about a dataflow."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.journal.reader import JournalReader, read_when_written
+from dora_systemd.decisions.cell.core_dumps import keeps_core_dumps
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus, is_stopped
 from dora_systemd.decisions.life import node_table
 from dora_systemd.decisions.life.causes import NO_END
@@ -14,9 +16,10 @@ from dora_systemd.decisions.releases.past import Switch, completed, undone
 from dora_systemd.decisions.views.dataflows import DEGRADED, FAILED, FROZEN
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
-from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE
+from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE, plain_text
 from dora_systemd.decisions.why.postmortem import examine
 from dora_systemd.decisions.why.report import LINES, Report, Subject
+from dora_systemd.decisions.why.stack import Frame, is_of_stack
 from dora_systemd.decisions.why.verdict import Facts, Verdict
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of, unit_name
@@ -30,9 +33,12 @@ from dora_systemd.verbs.facts.lives import now_boot, read_lives
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.stack import read_pattern, read_stack
 from dora_systemd.verbs.list import read_whole_rows
 
 _MOST_SHUTDOWNS = 20
+_FEWEST_LINES = 5
+"""Number of last lines with a long stack."""
 WORDS_OF_START = 10
 """Maximum number of lines that a failed start prints."""
 
@@ -49,15 +55,16 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     if cell and not verdict.is_given_up:
         budget = restart_budget(manager, scope, cell, read_status(scope, cell))
     last = _undone(scope, subject)
-    words = _last_words(journal, scope, subject, verdict)
+    stack = read_stack(journal, scope, subject.name, verdict)
+    words = _last_words(journal, scope, subject, verdict, stack)
     is_of_trial = not words and last is not None and last.how == TRIAL_FAILED
     if last and is_of_trial:
         words = _trial_words(journal, scope, subject, last)
     inhibitors = read_holders(scope, [cell.name]).get(cell.name, ()) if cell else ()
     is_held = cell is not None and _is_held(scope, cell, verdict.node)
     machines = _machines(manager, cell) if cell and cell.options.placed else {}
-    facts_of_trial = (last, is_of_trial)
-    return Report(subject, verdict, words, budget, inhibitors, is_held, machines, *facts_of_trial)
+    more = (last, is_of_trial, stack, keeps_core_dumps(read_pattern()))
+    return Report(subject, verdict, words, budget, inhibitors, is_held, machines, *more)
 
 
 def _verdict(journal: JournalReader, scope: Scope, subject: Subject, facts: Facts) -> Verdict:
@@ -185,9 +192,16 @@ def _shutdowns(journal: JournalReader) -> list[int]:
 
 
 def _last_words(
-    journal: JournalReader, scope: Scope, subject: Subject, verdict: Verdict
+    journal: JournalReader,
+    scope: Scope,
+    subject: Subject,
+    verdict: Verdict,
+    stack: Sequence[Frame],
 ) -> tuple[Word, ...]:
-    """The last lines of the node that failed first, up to its end; else those of all nodes."""
+    """The last lines of the node that failed first, up to its end; else those of all nodes.
+
+    stack: of that node. If Python has written it, it is not repeated.
+    """
     if not (verdict.is_failure or verdict.node) or not verdict.invocation:
         return ()
     invocation = f"_SYSTEMD_INVOCATION_ID={verdict.invocation}"
@@ -195,6 +209,9 @@ def _last_words(
     if verdict.node:
         matches.append(f"DORA_NODE={verdict.node}")
     records = journal.newest(matches, None, until_us=verdict.at_us, is_whole=True)
+    if stack:
+        own = (one for one in records if not is_of_stack(plain_text(one.get("MESSAGE"))))
+        return choose_last(own, max(LINES - len(stack), _FEWEST_LINES))
     return choose_last(records, LINES)
 
 

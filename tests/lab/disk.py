@@ -24,6 +24,14 @@ Restart=always
 OOMScoreAdjust=-1000
 """
 
+# What systemd-coredump needs; a library of elfutils finds the names of functions.
+COREDUMP_FILES = (
+    *("usr/lib/systemd/systemd-coredump", "usr/bin/coredumpctl", "usr/lib/*/lib*dw*.so*"),
+    *("usr/lib/*/libelf*.so*", "usr/lib/systemd/system/systemd-coredump*"),
+    *("usr/lib/systemd/system/*.wants/systemd-coredump*", "usr/lib/sysctl.d/50-coredump.conf"),
+    *("usr/lib/sysusers.d/systemd-coredump.conf", "etc/systemd/coredump.conf"),
+)
+
 # The modules of a kernel in user mode lie beside it, see user_kernel.py.
 MODULES_MOUNT = """\
 [Unit]
@@ -41,7 +49,8 @@ Options=ro,hostfs=/usr/lib/uml/modules
 
 def disk_layer(cache: Path) -> Layer:
     sources = [definition.read_part(definition.HERE / name) for name in SOURCES]
-    key = definition.digest(definition.base_key(), kernel_layer(cache).key, sources)
+    layers = (kernel_layer(cache).key, coredump_layer(cache).key)
+    key = definition.digest(definition.base_key(), *layers, sources)
     return Layer("disk", key, lambda path: build_disk(path, cache))
 
 
@@ -50,11 +59,18 @@ def kernel_layer(cache: Path) -> Layer:
     return unpacked_layer(cache, "kernel", [definition.KERNEL, "busybox-static"])
 
 
+def coredump_layer(cache: Path) -> Layer:
+    """For a kernel that is not shared with the host, which has its own kernel.core_pattern."""
+    return unpacked_layer(cache, "coredump", ["systemd-coredump", "libdw1t64"])
+
+
 def build_disk(path: Path, cache: Path) -> None:
     base = ensure(cache, base_layer(cache))
     kernel = ensure(cache, kernel_layer(cache))
+    coredump = ensure(cache, coredump_layer(cache))
     with Stage("disk of the machine"):
         write_extras(path / "extras", kernel)
+        copy_coredump(coredump, path / "extras")
         write_disk(path, base, cache / "disk.log")
 
 
@@ -73,6 +89,15 @@ def write_extras(path: Path, kernel: Path) -> None:
     (wants.parent / "systemd-udev-trigger.service").symlink_to("/dev/null")
     modules = kernel / "usr/lib/modules"
     subprocess.run(["cp", "--archive", "--link", str(modules), str(path / "usr/lib")], check=True)
+
+
+def copy_coredump(source: Path, path: Path) -> None:
+    """Of the unpacked packages what the base does not have."""
+    for pattern in COREDUMP_FILES:
+        for one in source.glob(pattern):
+            target = path / one.relative_to(source)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(one, target, follow_symlinks=False)
 
 
 def write_disk(path: Path, base: Path, log: Path) -> None:

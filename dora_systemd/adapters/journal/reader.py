@@ -142,14 +142,17 @@ class JournalReader:
         limit: int | None,
         until_us: int = 0,
         is_whole: bool = False,
+        fields: Sequence[str] = (),
     ) -> Iterator[dict[str, Any]]:
         """The matching records, newest first, as journalctl's JSON has them.
 
         until_us: CLOCK_REALTIME µs of the newest one, 0 for now. is_whole: include long fields.
+        fields: only these, () for all.
         """
         options = [] if limit is None else [f"--lines={limit}"]
         options += [f"--until={journal_timestamp(until_us)}"] if until_us else []
         options += ["--all"] if is_whole else []
+        options += [f"--output-fields={','.join(fields)}"] if fields else []
         words = ["--output=json", "--reverse", "--quiet", *options, "--", *matches]
         for line in _lines(words, self._bounds):
             yield json.loads(line)

@@ -3,10 +3,12 @@
 import re
 from collections.abc import Iterator
 
+from dora_systemd.decisions.cell.core_dumps import keeps_core_dumps
 from dora_systemd.decisions.views.findings import Finding, State
 
-_COREDUMP = re.compile(r"\|\S*/systemd-coredump(?:\s|$)")
 _APPORT = re.compile(r"\|\S*/apport(?:\s|$)")
+_ASSIGNMENT = re.compile(r"^[ \t]*(\w+)[ \t]*=(.*)$", re.M)
+_NONE = ("0", "0K", "0M", "0G", "0B")
 _INSTALL = "as root: apt install systemd-coredump"
 _COMMENT = re.compile(r"""("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/|^[ \t]*#[^\n]*""", re.S | re.M)
 _REBOOT = re.compile(r"Unattended-Upgrade::Automatic-Reboot(-Time)?\s*\"([^\"]*)\"\s*;", re.I)
@@ -16,18 +18,39 @@ _YES = ("1", "true", "yes", "on", "enable", "with")
 _ANY_TIME = "now"
 
 
-def judge_core_pattern(pattern: str) -> Finding:
-    """Judge whether `coredumpctl` shows a crash of a node. pattern: see kernel.core_pattern."""
+def judge_core_pattern(
+    pattern: str, is_there: bool = True, config: str = "", is_container: bool = False
+) -> Finding:
+    """Judge whether `why` and `coredumpctl` show a crash of a node.
+
+    pattern: see kernel.core_pattern. is_there: whether the program in the pattern exists. config:
+    of coredump.conf(5), in its order. is_container: the kernel is another system's.
+    """
     pattern = pattern.strip()
-    if _COREDUMP.match(pattern):
-        return Finding("core dumps", State.OK, "coredumpctl shows crashes of nodes")
+    if is_container:
+        text = "a crash of a node has no stack here: the core dumps of a container go to its host"
+        return Finding("core dumps", State.NOTE, text, "on the host: doractl doctor, coredumpctl")
+    if keeps_core_dumps(pattern):
+        return _judge_coredump(is_there, config)
     if _APPORT.match(pattern):
         text = "apport takes the core dumps of nodes, and discards those of programs of no package"
         remedy = f"{_INSTALL}; systemctl disable --now apport"
         return Finding("core dumps", State.NOTE, text, remedy)
     where = f"kernel.core_pattern is {pattern}" if pattern else "kernel.core_pattern is empty"
-    text = f"a node that crashes leaves no core dump for coredumpctl: {where}"
+    text = f"a node that crashes leaves no core dump for why and coredumpctl: {where}"
     return Finding("core dumps", State.NOTE, text, _INSTALL)
+
+
+def _judge_coredump(is_there: bool, config: str) -> Finding:
+    """Judge whether systemd-coredump is installed, and may process core dumps."""
+    if not is_there:
+        text = "kernel.core_pattern names systemd-coredump, which is not installed"
+        return Finding("core dumps", State.NOTE, text, _INSTALL)
+    values = {key: text.strip() for key, text in _ASSIGNMENT.findall(config)}
+    if values.get("ProcessSizeMax", "") in _NONE:
+        text = "ProcessSizeMax= in coredump.conf(5) is 0: a crash of a node has no stack"
+        return Finding("core dumps", State.NOTE, text, "as root: remove that line")
+    return Finding("core dumps", State.OK, "why and coredumpctl show where a node has crashed")
 
 
 def judge_reboots(config: str) -> Iterator[Finding]:

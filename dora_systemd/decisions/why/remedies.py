@@ -18,8 +18,7 @@ _MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (-
 _REMEDIES = {
     Cause.NODE_FAILED: f"fix {{node}}{AND_RESTART}",
     Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
-    Cause.NODE_WATCHDOG: "find out what {node} waited for (PYTHONFAULTHANDLER=1 prints that for "
-    "Python), or raise watchdog: in its settings",
+    Cause.NODE_WATCHDOG: "find out what {node} waited for, or raise watchdog: in its settings",
     Cause.NODE_SILENT: "find out why {node} sends nothing, or give it more time: "
     "owes: in the settings file",
     Cause.NODE_OUT_OF_MEMORY: "find the leak in {node}, or run: "
@@ -51,11 +50,13 @@ _MEMORY_REMEDIES = {
     "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
 }
 """Remedies by the owner of the exceeded memory limit, unless that is the node."""
+_COREDUMPCTL = "; coredumpctl info {pid} shows where it crashed"
+_NO_DUMP = "; doractl doctor says why there is no core dump that shows where it crashed"
 _SIGNAL_REMEDIES: Mapping[int, str] = {
     signal.SIGKILL: "find out who killed {node}: journalctl -k, or a kill -9 by hand",
     **dict.fromkeys(
         (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGILL, signal.SIGFPE),
-        "fix {node}; coredumpctl info {pid} shows where it crashed",
+        f"fix {{node}}{_COREDUMPCTL}",
     ),
 }
 _THAW = "somebody has frozen the unit; run: systemctl {flag} thaw {unit}"
@@ -83,6 +84,11 @@ def remedy_of(verdict: Verdict) -> str:
     remedy = _REMEDIES.get(verdict.cause, "")
     has_policy = verdict.policy not in ("", "no")
     return _BY_HAND if remedy == _AUTOMATIC and has_policy else remedy
+
+
+def about_core_dump(text: str, has_dump: bool, has_stack: bool) -> str:
+    """A remedy that mentions a core dump only if the machine keeps one."""
+    return text if has_dump else text.replace(_COREDUMPCTL, "" if has_stack else _NO_DUMP)
 
 
 _MORE = "see dora-systemd-security(7)"

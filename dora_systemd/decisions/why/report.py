@@ -17,7 +17,13 @@ from dora_systemd.decisions.views.objects import dataflow_object, moment, switch
 from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.decisions.why.last_lines import Word, shown_last
 from dora_systemd.decisions.why.lives import parse_number
-from dora_systemd.decisions.why.remedies import AND_RESTART, known_remedy, remedy_of
+from dora_systemd.decisions.why.remedies import (
+    AND_RESTART,
+    about_core_dump,
+    known_remedy,
+    remedy_of,
+)
+from dora_systemd.decisions.why.stack import Frame
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.names import release_of
 from dora_systemd.terminal_text import cut, one_line, wrapped
@@ -74,6 +80,8 @@ class Report:
     # the last change in the history of releases, if it was no new release
     undone: Switch | None = None
     is_of_trial: bool = False  # words are of the trial that has failed, in which `undone` ended
+    stack: tuple[Frame, ...] = ()  # of verdict.node, if a signal ended it
+    keeps_core_dumps: bool = True  # whether this machine does
 
     @property
     def node(self) -> str:
@@ -100,6 +108,8 @@ def remedies(report: Report) -> list[str]:
         texts.append(_GIVEN_UP)
     elif verdict.status == RESTARTING:
         texts.append(_WAITING)
+    has_dump, has_stack = report.keeps_core_dumps, bool(report.stack)
+    texts = [about_core_dump(text, has_dump, has_stack) for text in texts]
     values = {
         "name": subject.name,
         "node": report.node or "the node",
@@ -151,6 +161,7 @@ def format_report(report: Report, width: int | None = None, want_colors: bool = 
     """
     blocks = [
         [_title(report, width, want_colors), *_wrapped(_facts(report), width, 2 + _TITLE_WIDTH)],
+        _section("Where it crashed:", _cut(map(str, report.stack), width), want_colors),
         _section("What happened:", _cut(_timeline(report), width), want_colors),
         _section(cut(_words_title(report), width), _cut(_words(report), width), want_colors),
         _section("What to do:", _wrapped(remedies(report), width, 2), want_colors),
@@ -336,6 +347,7 @@ def report_object(report: Report, row: DataflowRow) -> dict[str, Any]:
         "details": _details(verdict.details),
         "starved": list(verdict.starved),
         "undone": switch_object(report.subject.name, report.undone) if report.undone else None,
+        "stack": [one._asdict() for one in report.stack],
         **_history(report),
         "remedies": remedies(report),
     }

@@ -81,6 +81,8 @@ export class Why {
     return [
       el("p", { class: "summary" }, badge, " ", el("strong", {}, why.summary)),
       this.#facts(why),
+      list("Where it crashed", "stack", (why.stack ?? []).map((one) =>
+        el("li", {}, `${one.function} (${one.place})`))),
       list("What to do", "remedies", why.remedies.map(remedy)),
       list(`The last ${last.length === 1 ? "line" : `${last.length} lines`} of ${why.node || "its nodes"}`, "words", last),
       why.node ? el("p", {}, el("button", { type: "button", class: "small",

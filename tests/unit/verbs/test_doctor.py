@@ -130,6 +130,26 @@ def test_what_others_have_set_up(manager: FakeManager, scope: Scope, tmp_path: P
     assert findings["upgrades"].state is State.WARNING
 
 
+def test_core_dumps_of_a_machine(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
+    config = tmp_path / "bin/systemd-analyze"
+    make_program(config, "echo ProcessSizeMax=0")
+    program = tmp_path / "usr/lib/systemd/systemd-coredump"
+    for path, text in {
+        tmp_path / "proc/sys/kernel/core_pattern": "|/usr/lib/systemd/systemd-coredump %P\n",
+        program: "",
+        tmp_path / "run/systemd/container": "systemd-nspawn\n",
+    }.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    assert "to its host" in found(manager, scope)["core dumps"].text
+    (tmp_path / "run/systemd/container").unlink()
+    assert "ProcessSizeMax=" in found(manager, scope)["core dumps"].text
+    make_program(config, "echo")
+    assert "core dumps" not in found(manager, scope)
+    program.unlink()
+    assert "not installed" in found(manager, scope)["core dumps"].text
+
+
 def test_nodes_with_another_dora(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
     venv = install(tmp_path / "venv", "dora_rs", "1.0.1")
     prefix = install(tmp_path / "tool", "dora_rs_cli", "1.1.0")

@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.logs.journal_events import EVENTS as KINDS
+from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.lives import now_boot
@@ -121,3 +124,61 @@ def test_an_end_that_journald_has_not_written_yet_is_read_again(scope: Scope) ->
     verdict = explain(manager, scope, "robot", journal).verdict  # type: ignore[arg-type]
     assert verdict.summary.startswith("node camera: exit code 3")
     assert journal.reads == 3
+
+
+PLACE = "/dora.slice/dora-robot.service/node-camera"
+DUMP = {
+    "_SYSTEMD_SLICE": r"system-systemd\x2dcoredump.slice",
+    "MESSAGE_ID": "fc2e22bc6ee647b6b90729ab34a250b1",
+    "MESSAGE": "dumped core.\n\nStack trace of thread 7:\n#0  0x01 grab (libgrab.so + 0x9)\n",
+    **{"COREDUMP_PID": "7", "COREDUMP_SIGNAL": "11", "COREDUMP_TIMESTAMP": "0"},
+    **{"COREDUMP_CGROUP": PLACE},
+}
+PYTHON_DUMP = (
+    "Fatal Python error: Segmentation fault",
+    "",
+    "Current thread 0x0001 (most recent call first):",
+    '  File "/home/camera.py", line 12 in read',
+)
+
+
+def crashed(journal: FakeJournal, scope: Scope, **dump: str) -> None:
+    """A journal with the crash of a node."""
+    by_scope = {"COREDUMP_USER_UNIT" if scope.is_user else "COREDUMP_UNIT": "dora-robot.service"}
+    by_scope |= {"COREDUMP_UID": str(scope.uid)} if scope.is_user else {}
+    own = dict(one.split("=", 1) for one in scope_matches(scope, "robot"))
+    pid = {"DORA_NODE_PID": "7"}
+    end = {"DORA_EVENT": "node-crashed", "DORA_EXIT": "signal SIGSEGV", **pid}
+    lines = [
+        record(2 + n, "camera", text, DORA_STREAM="stderr", **pid)
+        for n, text in enumerate(("looking for a camera", *PYTHON_DUMP))
+    ]
+    failed = {**EVENTS[-1], "DORA_NODES": "camera", "DORA_REASON": "node camera: signal SIGSEGV"}
+    story = [EVENTS[0], *lines, record(9, "camera", "crashed", **end), failed]
+    ids = {name: {"MESSAGE_ID": kind.message_id} for name, kind in KINDS.items()}
+    mine = [{**own, **one, **ids.get(one.get("DORA_EVENT", ""), {})} for one in story]
+    journal.write({**DUMP, **by_scope, **dump}, *reversed(mine))
+
+
+@pytest.mark.parametrize(
+    ("dump", "functions"),
+    [
+        ({}, ["grab", "read"]),
+        # Anybody can write the other fields.
+        ({"_SYSTEMD_SLICE": "user.slice"}, ["read"]),
+        ({"COREDUMP_PID": "8"}, ["read"]),
+    ],
+)
+def test_a_crash_has_its_stack(
+    dump: dict[str, str],
+    functions: list[str],
+    scope: ScopeIn,
+    manager: FakeManager,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    crashed(FakeJournal(monkeypatch, tmp_path), scope, **dump)
+    manager.add(options(), ActiveState="failed", SubState="failed")
+    report = explain(manager, scope, "robot", JournalReader())
+    assert [one.function for one in report.stack] == functions
+    assert [one.text for one in report.words] == ["looking for a camera"]

@@ -5,9 +5,11 @@ import pytest
 from dora_systemd.decisions.views.findings import State
 from dora_systemd.decisions.views.upkeep import judge_core_pattern, judge_reboots
 
+SYSTEMD = "|/usr/lib/systemd/systemd-coredump %P %u %g %s %t 9223372036854775808 %h %d\n"
 PATTERNS = {
-    "|/usr/lib/systemd/systemd-coredump %P %u %g %s %t 9223372036854775808 %h %d\n": "coredumpctl",
+    SYSTEMD: "coredumpctl",
     "|/usr/share/apport/apport -p%p -s%s -c%c -d%d -P%P -u%u -g%g -F%F -- %E\n": "apport takes",
+    "@@/run/systemd/coredumpd/kernel\n": "coredumpctl",
     "core\n": "kernel.core_pattern is core",
     "": "kernel.core_pattern is empty",
     "|/opt/systemd-coredump-like %P": "kernel.core_pattern is |/opt/",
@@ -20,6 +22,25 @@ def test_core_patterns(pattern: str, expected: str) -> None:
     assert expected in finding.text
     is_fine = expected == "coredumpctl"
     assert (finding.state is State.OK, bool(finding.remedy)) == (is_fine, not is_fine)
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        ("[Coredump]\n#ProcessSizeMax=0\n", "why and coredumpctl show"),
+        ("[Coredump]\nProcessSizeMax=2G\n", "why and coredumpctl show"),
+        ("[Coredump]\nProcessSizeMax=0\nProcessSizeMax = 1G\n", "why and coredumpctl show"),
+        ("[Coredump]\nStorage=none\nProcessSizeMax = 0\n", "ProcessSizeMax= in coredump.conf"),
+    ],
+)
+def test_what_systemd_coredump_may_process(config: str, expected: str) -> None:
+    assert expected in judge_core_pattern(SYSTEMD, config=config).text
+
+
+def test_core_dumps_of_other_systems() -> None:
+    assert "not installed" in judge_core_pattern(SYSTEMD, is_there=False).text
+    inside = judge_core_pattern(SYSTEMD, is_container=True)
+    assert (inside.state, "to its host" in inside.text) == (State.NOTE, True)
 
 
 ON = 'APT::Periodic::Unattended-Upgrade "1";\n'

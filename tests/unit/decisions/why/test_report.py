@@ -20,6 +20,7 @@ from dora_systemd.decisions.why.report import (
     remedies,
     report_object,
 )
+from dora_systemd.decisions.why.stack import NATIVE, PYTHON, Frame
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.names import STORE, TREE
 from dora_systemd.values import SECOND
@@ -351,6 +352,40 @@ AWAY = "camera stays down until doractl restart robot; the other nodes keep runn
 )  # fmt: skip
 def test_what_to_do(verdict: Verdict, lines: list[str]) -> None:
     assert remedies(replace(FULL, verdict=verdict)) == lines
+
+
+FRAMES = (
+    Frame(NATIVE, "grab\x1b[2J", "libgrab.so + 0x1119"),
+    Frame(PYTHON, "read", "/home/camera.py:12"),
+)
+
+
+def test_where_it_crashed() -> None:
+    """Before what happened: that is what somebody searches."""
+    text = format_report(replace(FULL, stack=FRAMES))
+    frames = (
+        "\nWhere it crashed:\n  grab\\x1b[2J (libgrab.so + 0x1119)\n  read (/home/camera.py:12)\n"
+    )
+    assert frames in text
+    assert text.index(frames) < text.index("What happened:")
+    assert "Where it crashed" not in format_report(FULL)
+    found = report_object(replace(FULL, stack=FRAMES), ROW)["stack"]
+    assert found[1] == {"language": "python", "function": "read", "place": "/home/camera.py:12"}
+
+
+@pytest.mark.parametrize(
+    ("has_dump", "stack", "remedy"),
+    [
+        (True, FRAMES, "fix camera; coredumpctl info PID shows where it crashed"),
+        (False, FRAMES, "fix camera"),
+        (False, (), "fix camera; doractl doctor says why there is no core dump that shows where it "
+         "crashed"),
+    ],
+)  # fmt: skip
+def test_what_to_do_about_a_crash(has_dump: bool, stack: tuple[Frame, ...], remedy: str) -> None:
+    verdict = replace(VERDICT, cause=Cause.NODE_FAILED, details={"exit": "signal SIGSEGV"})
+    report = replace(FULL, verdict=verdict, stack=stack, keeps_core_dumps=has_dump)
+    assert remedies(report) == [remedy]
 
 
 def test_what_to_do_about_a_release() -> None:
