@@ -177,11 +177,15 @@ def _meant_verb(name: str) -> str:
 
 
 def _near(error: click.NoSuchOption) -> list[str]:
-    """The options that click suggests, without those that only have the dashes in common."""
+    """The options that click suggests: those that are very similar, or else somewhat."""
     from difflib import get_close_matches
 
-    word = error.option_name.lstrip("-")
-    return [one for one in error.possibilities or () if get_close_matches(one.lstrip("-"), [word])]
+    word, options = error.option_name.lstrip("-"), error.possibilities or ()
+    for least in (0.8, 0.6):
+        near = [one for one in options if get_close_matches(one.lstrip("-"), [word], cutoff=least)]
+        if near:
+            return near
+    return []
 
 
 def _usage_error(error: click.ClickException) -> DoraSystemdError:

@@ -132,6 +132,11 @@ def test_every_option_says_what_it_does(name: str) -> None:
         (["qqq"], "unknown command 'qqq'", "doractl --help lists all commands"),
         (["membe"], "unknown command 'membe'", "doractl --help lists all commands"),
         (["list", "--oll"], "unknown option --oll", "did you mean --all?"),
+        (
+            ["start", "--memroy-limit"],
+            "unknown option --memroy-limit",
+            "did you mean --memory-limit?",
+        ),
         (["stop"], "cannot stop: give names or --all", "doractl stop NAME, or doractl stop --all"),
         (["stop", "x", "--all"], "cannot stop: give names or --all", ""),
         (["show"], "missing argument", "see doractl show --help"),
