@@ -15,6 +15,8 @@ UNIT_PREFIX = "dora-"
 UNIT_SUFFIX = ".service"
 LINK_PREFIX = "doralink-"
 """Prefix of the units of links to other machines."""
+NOTICE_PREFIX = "doranotice"
+"""Prefix of the units that send the notice of a failure."""
 SLICE = "dora.slice"
 RESERVED_NAMES = frozenset({"gateway"})
 """dora-gateway.service is the gateway."""
@@ -119,6 +121,16 @@ def name_from_path(path: str) -> str:
 def unit_name(name: str) -> str:
     """The systemd unit of the dataflow `name`, which must be valid."""
     return f"{UNIT_PREFIX}{name}{UNIT_SUFFIX}"
+
+
+def notice_unit(name: str, suffix: str = UNIT_SUFFIX) -> str:
+    """The unit that sends the notices of dataflow `name`; with ".path", the one that starts it."""
+    return f"{NOTICE_PREFIX}@{name}{suffix}"
+
+
+def notice_command_unit(name: str) -> str:
+    """The unit in which the command of a notice runs."""
+    return f"{NOTICE_PREFIX}-{name}{UNIT_SUFFIX}"
 
 
 def name_from_unit(unit: str) -> str | None:

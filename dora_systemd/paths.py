@@ -1,14 +1,33 @@
 """The files of one cell, in the RuntimeDirectory of its unit; the directories of unit files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import NOTICE_NAME
 
 _UNIT_PATH_HINT = "systemctl show --property UnitPath; is SYSTEMD_UNIT_PATH set for systemd?"
 
 TABLE = "status.json"
 """The live node table of a cell, in the RuntimeDirectory of its unit."""
+
+
+def own_directory(environment: Mapping[str, str]) -> str:
+    """The directory of the cell in RUNTIME_DIRECTORY, "" without one; see systemd.exec(5)."""
+    return next((one for one in _directories(environment) if not _is_of_notices(one)), "")
+
+
+def request_directory(environment: Mapping[str, str]) -> str:
+    """The directory in which a runner requests a notice, "" if its dataflow has no on_failure."""
+    return next(filter(_is_of_notices, _directories(environment)), "")
+
+
+def _directories(environment: Mapping[str, str]) -> list[str]:
+    return environment.get("RUNTIME_DIRECTORY", "").split(":")
+
+
+def _is_of_notices(directory: str) -> bool:
+    return Path(directory).parent.name == NOTICE_NAME
 
 
 class CellPaths:

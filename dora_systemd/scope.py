@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 RUNTIME_NAME = "dora-systemd"
+NOTICE_NAME = "dora-systemd-notice"
+"""The directory with a directory for each dataflow that has on_failure, see systemd.path(5)."""
 
 
 class Scope(NamedTuple):
@@ -30,6 +32,10 @@ class Scope(NamedTuple):
     def cell_directory(self, name: str) -> Path:
         """The RuntimeDirectory of the unit of dataflow `name`."""
         return self.runtime_root / RUNTIME_NAME / name
+
+    def notice_directory(self, name: str) -> Path:
+        """The directory in which the runner of dataflow `name` requests a notice."""
+        return self.runtime_root / NOTICE_NAME / name
 
     @property
     def transient_units(self) -> Path:

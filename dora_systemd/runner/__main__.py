@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.paths import CellPaths
+from dora_systemd.paths import CellPaths, own_directory
 from dora_systemd.runner.cell.begin import (
     allow_core_dumps,
     enter_supervisor,
@@ -36,7 +36,7 @@ def begin(argv: list[str]) -> "Begun | None":
 
     Returns None if that fails: run_cell() tries again and reports the error.
     """
-    directory = os.environ.get("RUNTIME_DIRECTORY")
+    directory = own_directory(os.environ)
     if directory:
         with contextlib.suppress(OSError, DoraSystemdError):
             with contextlib.suppress(OSError):

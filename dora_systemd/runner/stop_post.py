@@ -22,7 +22,7 @@ from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.decisions.resources.oom import Owner, largest, owner_details
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.paths import CellPaths
+from dora_systemd.paths import CellPaths, own_directory
 from dora_systemd.values import format_rounded_size
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ STREAMS = {".out": "stdout", ".err": "stderr"}
 def main(argv: list[str]) -> int:
     """Kill the nodes, and write their last lines and how the dataflow has ended."""
     deadline = time.monotonic() + ALL_SECONDS
-    (cause, reason), directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
+    (cause, reason), directory = killed_by(os.environ), own_directory(os.environ)
     if len(argv) != 2 or not directory:
         return 0
     if was_stopped_early(os.environ):

@@ -11,7 +11,7 @@ from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE, merge_node_limi
 from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, parse_setting
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_readable
-from dora_systemd.paths import CellPaths
+from dora_systemd.paths import CellPaths, own_directory
 from dora_systemd.values import format_bool, parse_bool, quoted
 
 MAX_ENTRY = 128 * 1024 - 1
@@ -46,7 +46,7 @@ _RESERVED = MANAGER_VARIABLES | {"CREDENTIALS_DIRECTORY"}
 def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """The runner's environment without the variables that systemd sets, with the lock file."""
     kept = {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
-    directory = environment.get("RUNTIME_DIRECTORY")
+    directory = own_directory(environment)
     return {**kept, LOCK_VARIABLE: str(CellPaths(Path(directory)).lock)} if directory else kept
 
 

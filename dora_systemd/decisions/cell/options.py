@@ -96,6 +96,7 @@ class RunnerOptions(NamedTuple):
     # machine, head: on a member its name, and the host name of the head; else ""
     machine: str = ""
     head: str = ""
+    on_failure: tuple[str, ...] = ()  # the command of a notice, or a unit; () for no notice
     addresses: tuple[str, ...] = ()  # with `link: direct` those of all machines, the own one first
 
     def __hash__(self) -> int:
@@ -194,6 +195,9 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
 _parse_rights = _late("cell.rights", "parse_node_rights")
 _format_rights = _late("cell.rights", "format_node_rights")
 _parse_owed, _format_owed = (_late("cell.owes", name) for name in ("parse_owed", "format_owed"))
+_parse_words, _format_words = (
+    _late("notice.command", name) for name in ("parse_words", "format_words")
+)
 _parse_watchdogs = _late("watchdog.watchdogs", "parse_sockets")
 
 
@@ -239,6 +243,7 @@ _OPTIONS = (
     _unless_default("machine", "machine", parse_machine),
     _unless_default("head", "head", parse_head),
     _each("address", "addresses", _late("machines.address", "parse_address")),
+    _unless_default("on-failure", "on_failure", _parse_words, _format_words),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

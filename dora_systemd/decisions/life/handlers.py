@@ -324,15 +324,15 @@ def node_exited(cell: Cell, event: life.NodeExited) -> Next:
     """Record the exit of a node; end the dataflow if an essential node will not restart."""
     after, actions = node_event(cell, event)
     before = cell.nodes.get(event.node)
-    if before is None or not event.is_essential or _is_replaced(cell, before):
+    if before is None or not event.is_essential or is_replaced(cell, before):
         return after, actions
-    return _without(after, event.node, actions) if _is_lost(after, event.node) else (after, actions)
+    return _without(after, event.node, actions) if is_lost(after, event.node) else (after, actions)
 
 
 def reload_noted(cell: Cell, event: life.ReloadNoted) -> Next:
     """Record the end of a reload; end the dataflow if the reload left an essential node failed."""
     after, actions = note_reload(cell, event)
-    lost = [node for node in event.essential if _is_lost(after, node)]
+    lost = [node for node in event.essential if is_lost(after, node)]
     return _without(after, lost[0], actions) if lost else (after, actions)
 
 
@@ -341,7 +341,7 @@ def node_reloading(cell: Cell, event: life.Event) -> Next:
     return node_event(replace(cell, notice=""), event)
 
 
-def _is_replaced(cell: Cell, node: NodeStatus) -> bool:
+def is_replaced(cell: Cell, node: NodeStatus) -> bool:
     """Whether this is the first process after a reload, whose failure the reloader undoes.
 
     While the dataflow runs, only such a process has never been ready and is no restart of dora's.
@@ -351,7 +351,7 @@ def _is_replaced(cell: Cell, node: NodeStatus) -> bool:
     return node.state == "starting" and not (node.restarts or cell.notice or node.asked)
 
 
-def _is_lost(cell: Cell, ident: str) -> bool:
+def is_lost(cell: Cell, ident: str) -> bool:
     """Whether a node has failed and will not start again.
 
     With the policy HELD a failed node waits for a reload. With LATCHED the end is not final yet: a

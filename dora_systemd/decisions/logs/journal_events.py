@@ -138,6 +138,15 @@ EVENTS = {
         WARNING,
         "Release {release} of dataflow {dataflow} was rolled back",
     ),
+    "node-given-up": EventKind("d96c6b0794944af2a5cfba088b5d31ec", ERR, "Node {node} is given up"),
+    "notice-sent": EventKind(
+        "4b9fd4f8ba98421b984bb7516521b9dc", NOTICE, "Notice about dataflow {dataflow} is sent"
+    ),
+    "notice-failed": EventKind(
+        "e7cce21261c04ef187daa5f0fea38c01",
+        WARNING,
+        "Notice about dataflow {dataflow} is not sent",
+    ),
     "build-failed": EventKind(
         "c598b7b44f614a64a048fc856c696082",
         WARNING,
@@ -153,6 +162,7 @@ NODE_END_EVENTS = ("node-exited", "node-crashed", "node-ended", "node-oom")
 ROLLED_BACK = "release-rolled-back"
 BUILD_FAILED = "build-failed"
 FORGOTTEN = "dataflow-forgotten"
+GIVEN_UP, NOTICE_SENT, NOTICE_FAILED = "node-given-up", "notice-sent", "notice-failed"
 REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK, BUILD_FAILED)
 """What doractl writes about a dataflow, outside of its unit."""
 

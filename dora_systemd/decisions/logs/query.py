@@ -8,7 +8,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dora_systemd.decisions.logs.journal_events import EVENTS, REQUESTS
+from dora_systemd.decisions.logs.journal_events import (
+    EVENTS,
+    GIVEN_UP,
+    NOTICE_FAILED,
+    NOTICE_SENT,
+    REQUESTS,
+    ROLLED_BACK,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, unit_name
 from dora_systemd.scope import Scope
@@ -167,6 +174,15 @@ def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
     own = [*scope_matches(scope, name), dataflow, *_event_matches()]
     asked = [dataflow, *_asked_matches(scope, *REQUESTS)]
     return [*own, "+", *_systemd_matches(scope, name), "+", *asked]
+
+
+def notice_matches(scope: Scope, name: str) -> list[str]:
+    """Matches for all that a notice reports, and for the notices that were sent."""
+    events = [f"DORA_EVENT={one}" for one in ("dataflow-failed", "machine-lost", GIVEN_UP)]
+    asked = _asked_matches(scope, ROLLED_BACK, NOTICE_SENT, NOTICE_FAILED)
+    failures = [*_systemd_matches(scope, name), f"MESSAGE_ID={UNIT_FAILED}"]
+    own = [*scope_matches(scope, name), *events]
+    return [*own, "+", *failures, "+", *asked, f"DORA_DATAFLOW_NAME={name}"]
 
 
 def request_matches(scope: Scope, *events: str) -> list[str]:

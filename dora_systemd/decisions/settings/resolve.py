@@ -23,6 +23,7 @@ from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.needs import NEEDS
+from dora_systemd.decisions.settings.on_failure import ON_FAILURE
 from dora_systemd.decisions.settings.owes import NOTIFY, OWES, WATCHDOG, owes_of
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
@@ -266,6 +267,7 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         reload=hot_reload(settings, options.working_directory),
         owes=owes_of(settings.by_node(OWES), settings[OWES]),
         settings=tuple(runner_texts(settings)),
+        on_failure=settings[ON_FAILURE],
     )
 
 

@@ -25,6 +25,7 @@ from dora_systemd.decisions.settings.kinds import (
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, LIVE_SETTINGS
 from dora_systemd.decisions.settings.machines import MACHINE_SETTINGS
 from dora_systemd.decisions.settings.needs import NEED_SETTINGS
+from dora_systemd.decisions.settings.on_failure import NOTICE_SETTINGS
 from dora_systemd.decisions.settings.owes import OWES_SETTINGS, SIGN_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
@@ -108,6 +109,7 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     "Stop": STOP_SETTINGS,
     "Signs of life": SIGN_SETTINGS,
     "Owed outputs": OWES_SETTINGS,
+    "Notice of a failure": NOTICE_SETTINGS,
     "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),
     "Hot reload": RELOAD_SETTINGS,
     "Machines": MACHINE_SETTINGS,

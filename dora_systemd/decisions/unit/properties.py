@@ -39,8 +39,8 @@ from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import SLICE, release_of, unit_description
-from dora_systemd.scope import RUNTIME_NAME
+from dora_systemd.names import SLICE, notice_unit, release_of, unit_description
+from dora_systemd.scope import NOTICE_NAME, RUNTIME_NAME
 from dora_systemd.values import INFINITY, SECOND, quoted
 
 WATCHDOG = 30 * SECOND
@@ -91,6 +91,7 @@ def unit_properties(
         **needs_properties(settings[NEEDS], context.clock),
         **device_properties(options, context),
     }
+    own = with_properties(own, notice_properties(options))
     properties = with_properties(own, settings_properties(settings))
     of_machines = address_properties(options.addresses, context.is_user)
     properties = with_properties(properties, of_machines)
@@ -207,6 +208,21 @@ def directory_properties(options: RunnerOptions) -> dict[str, Property]:
     return typed(
         RuntimeDirectory=(f"{RUNTIME_NAME}/{options.name}",),
         RuntimeDirectoryMode=0o700,
+    )
+
+
+def notice_properties(options: RunnerOptions) -> dict[str, Property]:
+    """What starts the notice of a failure: a failure of the unit, and a request of the runner.
+
+    The request is a file in a directory of the runner. Its parent is root's: systemd follows links
+    when it watches a path, so the runner must not be able to replace any part of that path.
+    """
+    if not options.on_failure:
+        return {}
+    return typed(
+        OnFailure=(notice_unit(options.name),),
+        Wants=(notice_unit(options.name, ".path"),),
+        RuntimeDirectory=(f"{NOTICE_NAME}/{options.name}",),
     )
 
 

@@ -25,7 +25,10 @@ class SetupFile(NamedTuple):
     link: str = ""
 
 
-_UNITS = ("dora.slice", "dora.target", "dora-gateway.socket", "dora-gateway.service")
+_UNITS = (
+    *("dora.slice", "dora.target", "dora-gateway.socket", "dora-gateway.service"),
+    *("doranotice@.path", "doranotice@.service"),
+)
 SANDBOX = SetupFile(
     ("templates", "dora-gateway-sandbox.conf"), "dora-gateway.service.d/10-sandbox.conf"
 )

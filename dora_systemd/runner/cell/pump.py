@@ -67,6 +67,7 @@ class Pump:
     end: resolves to the exit status, even if the action EXIT fails. amend: adds the nodes of other
     machines to the table. on_event: receives each event before the event changes the cell. on_node:
     carries out the actions of a stop that has an order.
+    on_change: receives each event after its actions, with the cells before and after it.
     """
 
     def __init__(
@@ -89,6 +90,7 @@ class Pump:
         self._is_unwritten = False
         self.on_event: Callable[[life.Event], None] = lambda _: None
         self.on_node: Callable[[NodeAction], None] = lambda _: None
+        self.on_change: Callable[[life.Event, Cell, Cell], None] = lambda *_: None
         self.amend: Callable[[CellStatus], CellStatus] = lambda table: table
         self._waiting: list[tuple[Callable[[Cell], bool], asyncio.Future[None]]] = []
 
@@ -127,6 +129,8 @@ class Pump:
         for action in actions:
             with self._guard(_name(action)):
                 self._perform(action)
+        with self._guard("request a notice"):
+            self.on_change(event, before, self.cell)
         if self.cell.state is State.ENDED and not self.end.done():
             self.end.set_result(self.cell.exit)  # the action EXIT failed
 

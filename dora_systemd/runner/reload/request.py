@@ -9,12 +9,12 @@ from pathlib import Path
 
 from dora_systemd.adapters.runner_socket.client import ask, done_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.paths import CellPaths
+from dora_systemd.paths import CellPaths, own_directory
 
 
 def main() -> int:
     """Request a reload; 0, or the exit status of doractl for the error."""
-    directory = os.environ.get("RUNTIME_DIRECTORY", "")
+    directory = own_directory(os.environ)
     try:
         if not directory:
             hint = "systemd runs this: use `doractl reload`"

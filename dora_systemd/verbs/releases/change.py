@@ -24,7 +24,7 @@ from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.decisions.why.remedies import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
-from dora_systemd.names import unit_name
+from dora_systemd.names import notice_unit, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.locks import IfInhibited, uninhibited
@@ -201,12 +201,20 @@ def _roll_back(attempt: _Attempt, fault: Fault, mark: _Mark) -> DoraSystemdError
     uuid, details = change.options.uuid, {"release": change.release, "former": former}
     reasons = {"nodes": fault.node, "reason": fault.reason}
     note_request(ROLLED_BACK, name, uuid, change.by, **details, **reasons)
+    _request_notice(manager, change.options)
     return DoraSystemdError(
         f"release {change.release} of {name} was rolled back: {fault.reason}",
         f"{now}; {known_remedy(fault.lines) or f'doractl why {name} shows more'}",
         ExitCode.ROLLED_BACK,
         fault.lines,
     )
+
+
+def _request_notice(manager: Manager, options: RunnerOptions) -> None:
+    """Start the service that sends notices, if the dataflow has any. Its absence fails nothing."""
+    if options.on_failure:
+        with suppress(DoraSystemdError):
+            manager.queue_job("StartUnit", notice_unit(options.name))
 
 
 def _end_alone(scope: Scope, standing: Standing, change: Change, life: str, mark: _Mark) -> None:

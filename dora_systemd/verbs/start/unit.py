@@ -29,6 +29,7 @@ from dora_systemd.trust.paths import exists
 from dora_systemd.values import quoted
 from dora_systemd.verbs.start.limits import check_limits
 from dora_systemd.verbs.start.needs import Needy, check_needs, clock_service, needs_warnings
+from dora_systemd.verbs.start.on_failure import check_units
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.read import key_place
 from dora_systemd.verbs.start.sandbox import sandbox_warnings
@@ -47,6 +48,7 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     needs, allowed = plan.settings[NEEDS], plan.settings[DEVICE]
     check_needs(manager, Needy(plan.options.name, plan.scope.is_user, needs))
     number = systemd_number(manager)
+    check_units(manager, plan.scope, plan.options)
     properties, warnings = drop_unsupported(_properties(plan, lambda: manager), number)
     warnings = (
         *warnings,

@@ -31,6 +31,7 @@ from dora_systemd.trust.paths import Place, reached, user_name
 from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.trust.sight import Sight, cannot_reach
 from dora_systemd.values import quoted, shown
+from dora_systemd.verbs.start.on_failure import find_command
 from dora_systemd.verbs.start.programs import check_program
 from dora_systemd.verbs.start.read import Files
 from dora_systemd.verbs.start.request import StartRequest
@@ -162,6 +163,9 @@ def find_where(
         addresses=request.addresses,
     )
     options = with_settings(options, settings)
+    command = () if options.machine else options.on_failure  # the head sends the notices
+    found = find_command(command, look.sight, look.user, search_path)
+    options = options._replace(on_failure=found)
     if options.hot_reload:
         # Imported late: few dataflows have it, and asyncio is slow to import.
         from dora_systemd.adapters.host.watch import require_watcher

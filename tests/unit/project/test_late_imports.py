@@ -90,6 +90,7 @@ LATE = {
             *("adapters.dora.probe", "decisions.machines.part", "decisions.settings.runner"),
         },
         "runner.main": {
+            "runner.cell.notices",
             *("runner.machines.head", "runner.machines.member", "runner.needs"),
             "runner.cell.node_stops",
             "runner.owes.watch",

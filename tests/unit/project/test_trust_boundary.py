@@ -45,7 +45,7 @@ OTHERWISE = (
 _TABLE = {
     DOOR: """
         trust.courier trust.eyes trust.files trust.locks trust.paths trust.project trust.programs
-        trust.sight trust.sockets trust.terminals trust.tree
+        trust.requests trust.sight trust.sockets trust.terminals trust.tree
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh cli.main
@@ -80,8 +80,8 @@ _TABLE = {
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
         runner.cell.restarts runner.machines.boot
         adapters.host.presence runner.requests runner.needs runner.nodes.launcher_gates
-        runner.cell.engine runner.cell.pump runner.machines.head runner.machines.roster
-        runner.main runner.nodes.nodes
+        runner.cell.engine runner.cell.notices runner.cell.pump runner.machines.head
+        runner.machines.roster runner.main runner.nodes.nodes
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
     OTHERWISE: """

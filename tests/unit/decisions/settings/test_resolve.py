@@ -219,6 +219,7 @@ def test_values_and_back(data: st.DataObject) -> None:
         "grace_duration": st.integers(0, 2**64 - 1),
         "stop_limit": st.integers(0, 2**60),
         "stop": st.builds(NodeStop, st.just(""), st.integers(1, 2**60), st.just(("arm", "cam"))),
+        "on_failure": st.just(("/bin/x", "a b", "$c")) | st.just(("unit:tell@.service",)),
         "owes": st.just((Owed("cam", "image", 2 * SECOND),)) | st.just(()),
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))

@@ -1,0 +1,150 @@
+"""Sends one notice: writes the report of `doractl why`, and runs the command of the setting."""
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager
+from dora_systemd.adapters.host.files import write_atomic
+from dora_systemd.adapters.journal.note import note_request
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.logs.journal_events import NOTICE_FAILED, NOTICE_SENT
+from dora_systemd.decisions.notice.command import unit_of
+from dora_systemd.decisions.notice.happened import (
+    Happened,
+    format_environment,
+    summary,
+    variables,
+)
+from dora_systemd.decisions.notice.unit import (
+    JSON,
+    SECONDS,
+    NoticeUnit,
+    names_to_copy,
+    notice_properties,
+)
+from dora_systemd.decisions.unit.systemd_versions import transient_commands
+from dora_systemd.decisions.why.report import format_report, report_object
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import notice_command_unit, unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.start.unit import systemd_number
+from dora_systemd.verbs.why import explain, subject_row
+
+BY = "doranotice"
+_POLL_SECONDS = 0.2
+_TEXT = "why.txt"
+_ENVIRONMENT = "environment"
+_RESULTS = {
+    "timeout": f"it has not ended within {SECONDS} s",
+    "oom-kill": "it has used up its memory",
+}
+
+
+class Sender:
+    """Sends the notices of one dataflow. place: a directory that only this user can read."""
+
+    def __init__(
+        self, manager: Manager, scope: Scope, name: str, journal: JournalReader, place: Path
+    ) -> None:
+        self._manager, self._scope, self._name = manager, scope, name
+        self._journal, self._place = journal, place
+
+    def send(self, happened: Sequence[Happened], pause_us: int) -> None:
+        """Run the command of the setting, and record the notice, whatever came of it."""
+        cell = read_cell(self._manager, unit_name(self._name))
+        if cell is None or not cell.options.on_failure:
+            return self._record("", happened, pause_us, "the dataflow has no on_failure any more")
+        node = self._write_report(cell, happened)
+        try:
+            problem = self._run(cell, happened, node)
+        except DoraSystemdError as error:
+            problem = error.message
+        return self._record(cell.uuid, happened, pause_us, problem, node)
+
+    def _write_report(self, cell: Cell, happened: Sequence[Happened]) -> str:
+        """Write the report of `doractl why`, as text and JSON; return the node that it names."""
+        head = summary(self._name, os.uname().nodename, happened)
+        try:
+            report = explain(self._manager, self._scope, cell.uuid, self._journal)
+            row = subject_row(self._manager, self._scope, report.subject)
+            text, found = format_report(report), report_object(report, row)
+            node = report.verdict.node
+        except DoraSystemdError as error:
+            text, found, node = f"{error.message}; {error.hint}", {}, ""
+        write_atomic(self._place / _TEXT, f"{head}\n\n{text}\n", 0o600)
+        write_atomic(self._place / JSON, json.dumps(found), 0o600)
+        return node
+
+    def _run(self, cell: Cell, happened: Sequence[Happened], node: str) -> str:
+        """Run the command, or start the unit; return what went wrong, or ""."""
+        own, host = notice_command_unit(self._name), os.uname().nodename
+        unit = unit_of(cell.options.on_failure, self._name)
+        is_here = self._scope.is_user or unit
+        evidence = self._place / JSON if is_here else Path("/run/credentials") / own / JSON
+        values = variables(self._name, host, cell.unit, happened, node, str(evidence))
+        if unit:
+            write_atomic(self._place / _ENVIRONMENT, format_environment(values), 0o600)
+            return self._start(unit)
+        types = self._manager.property_types()
+        copied = self._manager.read(cell.unit, names_to_copy(types))
+        if not self._scope.is_user and not copied.get("User"):
+            return f"{cell.unit} has no User="
+        of_nodes = self._manager.read(cell.unit, ["Environment"])["Environment"]
+        wanted = NoticeUnit(
+            name=self._name,
+            uuid=cell.uuid,
+            words=cell.options.on_failure,
+            directory=cell.options.working_directory,
+            environment=(*of_nodes, *(f"{key}={text}" for key, text in values.items())),
+            stdin=str(self._place / _TEXT),
+            evidence=str(self._place / JSON),
+            cell_directory=str(self._scope.cell_directory(self._name)),
+            is_user=self._scope.is_user,
+        )
+        self._forget(own)
+        number = systemd_number(self._manager)
+        properties = transient_commands(notice_properties(wanted, copied, types), number)
+        result = self._manager.start_transient(own, properties, None, wait=True)
+        return "" if result == JOB_DONE else self._problem(own)
+
+    def _start(self, unit: str) -> str:
+        """Start the unit of the setting, and wait a moment for its end, because it reads files."""
+        self._manager.queue_job("StartUnit", unit)
+        deadline = time.monotonic() + SECONDS
+        while time.monotonic() < deadline:
+            state = self._manager.read(unit, ["ActiveState", "Job"])
+            if not (state["Job"] or (0,))[0] and state["ActiveState"] != "activating":
+                return f"{unit} failed" if state["ActiveState"] == "failed" else ""
+            time.sleep(_POLL_SECONDS)
+        return f"{unit} has not started within {SECONDS} s"
+
+    def _problem(self, unit: str) -> str:
+        facts = self._manager.read(unit, ["Result", "ExecMainStatus", "ActiveState"])
+        if facts["ActiveState"] in DOWN:
+            self._forget(unit)
+        plain = f"{facts['Result']}, exit status {facts['ExecMainStatus']}"
+        return _RESULTS.get(str(facts["Result"]), plain)
+
+    def _forget(self, unit: str) -> None:
+        if self._manager.read(unit, ["ActiveState"])["ActiveState"] == "failed":
+            self._manager.reset_failed(unit)
+
+    def _record(
+        self, uuid: str, happened: Sequence[Happened], pause_us: int, problem: str, node: str = ""
+    ) -> None:
+        """Write the record that the next notice begins after."""
+        text = summary(self._name, os.uname().nodename, happened, node)
+        note_request(
+            NOTICE_FAILED if problem else NOTICE_SENT,
+            self._name,
+            uuid,
+            BY,
+            reason=problem or text,
+            count=str(len(happened)),
+            until=str(happened[0].mono_us),
+            pause=str(pause_us),
+        )
