@@ -14,6 +14,7 @@ from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope, scope_of
+from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.verbs.facts.cells import read_cells
 
 _FLAGS: dict[str, dict[str, Any]] = {
@@ -174,6 +175,9 @@ def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
         _print_view(format_dataflows(rows, width, want_colors=_wants_colors()))
         if width is not None and not all(map(is_up_word, rows)):
             print(f"\n{_MORE}")
+        if width is not None and (others := [row for row in rows if row.upgrade[0]]):
+            lines = (cut(one_line(f"{one.name} {': '.join(one.upgrade)}"), width) for one in others)
+            print("", *lines, sep="\n")
     else:
         _print_nothing(request)
 

@@ -51,8 +51,9 @@ from dora_systemd.trust.paths import exists
 from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sight import sight_of
 from dora_systemd.trust.socket_table import TABLES, listening_sockets
-from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
+from dora_systemd.verbs.facts.list import dataflow_row
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.facts.stack import read_pattern
 from dora_systemd.verbs.gateway import read_gateway
@@ -252,9 +253,14 @@ def _dora(_scope: Scope, _root: Path) -> Iterator[Finding]:
 
 
 def _versions(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
-    """Compare the dora of nodes with that of their daemon, as their user sees the files."""
-    del scope
-    for cell in read_cells(manager):
+    """Compare the dora of nodes with that of their daemon, as their user sees the files.
+
+    Also the version of each runner with this one.
+    """
+    for cell in proven(read_cells(manager)):
+        text, remedy = dataflow_row(manager, scope, cell).upgrade
+        if text:
+            yield Finding("versions", State.NOTE, f"{cell.name}: {text}", remedy)
         user = manager.read(cell.unit, ["User"])["User"]
         account = account_from(pwd.getpwnam(user)) if user else None
         with sight_of(account) as sight:

@@ -333,9 +333,33 @@ def build_command(python: str, task: str) -> list[str]:
 
 def options_from_command(command: Sequence[str]) -> RunnerOptions:
     """The options in an ExecStart= of runner_command; raises DoraSystemdError for any other."""
+    return parse_runner_argv(_arguments(command))
+
+
+def known_options_from_command(command: Sequence[str]) -> RunnerOptions:
+    """The options that this version knows, in an ExecStart= that another version has written.
+
+    What is optional and unknown, or has a value that this version does not know, is left out.
+    Raises DoraSystemdError for a command that is no runner's.
+    """
+    arguments = _arguments(command)
+    return parse_runner_argv([*filter(_is_known, arguments[:-1]), *arguments[-1:]])
+
+
+def _is_known(argument: str) -> bool:
+    key = argument.removeprefix("--").partition("=")[0]
+    try:
+        option, text = _split(argument)
+        option.parse([text])
+    except DoraSystemdError:
+        return key in _REQUIRED  # an error that the caller reports
+    return True
+
+
+def _arguments(command: Sequence[str]) -> Sequence[str]:
     if RUNNER_MODULE not in command:
         raise _refusal(f"{quoted(' '.join(command))} is not a runner of dora-systemd")
-    return parse_runner_argv(command[list(command).index(RUNNER_MODULE) + 1 :])
+    return command[list(command).index(RUNNER_MODULE) + 1 :]
 
 
 def _python(python: str, module: str = "") -> list[str]:
@@ -345,7 +369,10 @@ def _python(python: str, module: str = "") -> list[str]:
 
 
 def _refusal(reason: str) -> DoraSystemdError:
-    hint = "the runner is started by doractl, not by hand"
+    hint = (
+        "the runner is started by doractl; if that was another version, stop the dataflow and "
+        "start its file again"
+    )
     return DoraSystemdError(
         f"cannot read the runner's command line: {reason}", hint, ExitCode.USAGE
     )

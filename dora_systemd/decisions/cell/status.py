@@ -6,9 +6,11 @@ is_stopped().
 """
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
+from dora_systemd import __version__
 from dora_systemd.decisions.cell.exits import Exit, parse_exit
 from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, LineCount
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -59,6 +61,7 @@ _MAX_TEXT = 1000
 _MAX_NUMBER = 2**63 - 1
 _MAX_TIME = 253_370_764_800_000_000
 """The year 9999, CLOCK_REALTIME in µs: the last year that a date can have."""
+_VERSION = re.compile(r"[0-9][0-9A-Za-z.+~-]{0,39}", re.ASCII)
 _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
 
 
@@ -109,6 +112,7 @@ class CellStatus(NamedTuple):
     signs: Mapping[str, tuple[Any, ...]] = {}
     # of nodes on other machines, for parse_use() of dora_systemd.decisions.machines.usage
     usage: Mapping[str, Sequence[Any]] = {}
+    version: str = __version__  # of the dora-systemd that wrote it, or "" of a version before
 
     @property
     def alive_count(self) -> int:
@@ -182,6 +186,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         is_first=known.get("is_first") is True,
         signs=_by_node(known.get("signs", {}), tuple),
         usage=_by_node(known.get("usage", {}), tuple),
+        version=_version(known),
     )
 
 
@@ -212,6 +217,13 @@ def _machine(raw: Mapping[str, Any]) -> str:
     if name and not is_name(name):
         raise _Wrong("it has a machine without a name")
     return name
+
+
+def _version(raw: Mapping[str, Any]) -> str:
+    text = _text(raw, "version")
+    if text and not _VERSION.fullmatch(text):
+        raise _Wrong("its version is none")
+    return text
 
 
 def _parse_sample(raw: Any) -> CpuSample:

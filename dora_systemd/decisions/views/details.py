@@ -45,6 +45,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("Started", zoned_time(row.started) if row.started else ""),
         ("Ready", zoned_time(row.ready) if is_up_word(row) else ""),
         ("Ended", zoned_time(row.ended) if row.ended else ""),
+        ("Version", ": ".join(filter(None, row.upgrade))),
         ("Nodes", row.problem),
         ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from dora_systemd import __version__
 from dora_systemd.decisions.views.facts import USAGE, Fact, NodeRow
 from dora_systemd.names import release_of
 
@@ -56,11 +57,25 @@ class DataflowRow(NamedTuple):
     waits_since: int = 0  # since when systemd waits, CLOCK_REALTIME µs
     machines: tuple[str, ...] = ()  # the other machines that run nodes of the dataflow
     machine: str = ""  # the name of this machine if the head is elsewhere, or ""
+    runner_version: str = ""  # of dora-systemd when it was started, "" if that is not known
+    options_problem: str = ""  # why this doractl does not know all its options, or ""
 
     @property
     def release(self) -> str:
         """The release that it runs, "" if it was not deployed."""
         return release_of(self.dataflow) or self.listed_release
+
+    @property
+    def upgrade(self) -> tuple[str, str]:
+        """Which other version of dora-systemd runs it, and what to do; "" if none does."""
+        if self.options_problem:
+            # A restart would start the same command line, which the installed runner refuses.
+            todo = f"doractl stop {self.name}, then doractl start {self.dataflow}"
+            return f"another version has started it: {self.options_problem}", todo
+        if self.runner_version in ("", __version__):
+            return "", ""
+        text = f"runs {self.runner_version}, {__version__} is installed"
+        return text, f"doractl restart {self.name}"
 
 
 DATAFLOW_FACTS = (
@@ -88,4 +103,6 @@ DATAFLOW_FACTS = (
     Fact("restart_budget"),
     Fact("machine"),
     Fact("machines", value=list),
+    Fact("runner_version"),
+    Fact("options_problem"),
 )

@@ -36,6 +36,8 @@ class Cell:
         """The UUID of the dataflow, which restarts keep."""
         self._manager: Manager | None = None if options else manager
         self._options = options
+        self.options_problem = ""
+        """What this version does not know of the options, which another version has written."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Cell) and (self.state, self.uuid) == (other.state, other.uuid)
@@ -79,7 +81,7 @@ class Cell:
         Raises DoraSystemdError (NOT_FOUND) if it is not a dataflow of ours (any more).
         """
         if self._options is None and self._manager is not None:
-            self._options = _read_options(self._manager, self.unit)
+            self._options, self.options_problem = _read_options(self._manager, self.unit)
             self._manager = None  # the gateway keeps cells, and must not keep their connections
         if self._options is None:
             message = f"cannot read {self.unit}: it has ended, or is no dataflow"
@@ -151,20 +153,32 @@ def _listed(manager: Manager, state: UnitState) -> Cell | None:
 
 def _asked(manager: Manager, state: UnitState) -> Cell | None:
     """Read the dataflow of a unit by its ExecStart=, as the owner may change Description=."""
-    options = _read_options(manager, state.unit)
-    return Cell(state, options.uuid, manager, options) if options else None
+    options, problem = _read_options(manager, state.unit)
+    if options is None:
+        return None
+    cell = Cell(state, options.uuid, manager, options)
+    cell.options_problem = problem
+    return cell
 
 
-def _read_options(manager: Manager, unit: str) -> "RunnerOptions | None":
+def _read_options(manager: Manager, unit: str) -> "tuple[RunnerOptions | None, str]":
     # Imported late: the list of what runs has all it needs from systemd's own list.
-    from dora_systemd.decisions.cell.options import options_from_command
+    from dora_systemd.decisions.cell.options import (
+        known_options_from_command,
+        options_from_command,
+    )
 
     commands: Any = manager.read(unit, ["ExecStart"])["ExecStart"]
+    problem = ""
     try:
-        options = options_from_command(commands[0][1])
+        try:
+            options = options_from_command(commands[0][1])
+        except DoraSystemdError as error:
+            options = known_options_from_command(commands[0][1])
+            problem = error.message
     except (DoraSystemdError, IndexError):
-        return None
-    return options if name_from_unit(unit) == options.name else None
+        return None, ""
+    return (options, problem) if name_from_unit(unit) == options.name else (None, "")
 
 
 def refuse_parts(cells: Iterable[Cell], verb: str) -> None:

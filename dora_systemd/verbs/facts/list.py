@@ -54,6 +54,8 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "text": _text(unit, status).removeprefix(FAILED_BECAUSE),
         "restarts": unit["NRestarts"],
         "problem": reading.problem,
+        "runner_version": status.version if status.uuid else "",
+        "options_problem": cell.options_problem,
         **_machines(cell),
     }
     if held := reading.held:

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from dora_systemd import __version__
+from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -16,7 +18,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.doctor import JOURNALD, examine, guarded
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
-from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_dora, make_program
 from tests.unit.verbs.start.test_programs import install
 from tests.unit.verbs.start.test_start import make_plan, place
@@ -157,6 +159,16 @@ def test_nodes_with_another_dora(manager: FakeManager, scope: Scope, tmp_path: P
     finding = found(manager, scope)["versions"]
     assert finding.text == "robot: the nodes' dora is 1.0.1, the daemon is 1.1.0"
     assert finding.remedy.endswith("dora-rs==1.1.0")
+
+
+def test_dataflows_of_another_version(manager: FakeManager, scope: Scope) -> None:
+    manager.add(options())
+    directory = scope.cell_directory("robot")
+    directory.mkdir(parents=True)
+    (directory / "status.json").write_text(CellStatus(UUID, version="0.0.9").to_json())
+    finding = found(manager, scope)["versions"]
+    assert finding.text == f"robot: runs 0.0.9, {__version__} is installed"
+    assert (finding.state, finding.remedy) == (State.NOTE, "doractl restart robot")
 
 
 def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:

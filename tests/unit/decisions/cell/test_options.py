@@ -17,6 +17,7 @@ from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     SettingText,
     format_runner_argv,
+    known_options_from_command,
     options_from_command,
     parse_runner_argv,
     runner_command,
@@ -178,6 +179,26 @@ def test_bad_command_lines(argv: list[str]) -> None:
 def test_other_commands_are_no_runners() -> None:
     with pytest.raises(DoraSystemdError, match="is not a runner"):
         options_from_command(["/usr/bin/python3", "-m", "http.server"])
+
+
+@pytest.mark.parametrize("unknown", ["--colour=red", "--colour", "--restart=often", "--uv=yes"])
+def test_options_of_another_version_are_left_out(unknown: str) -> None:
+    command = runner_command("/usr/bin/python3", OPTIONS)
+    command.insert(-1, unknown)
+    with pytest.raises(DoraSystemdError):
+        options_from_command(command)
+    assert known_options_from_command(command) == OPTIONS
+
+
+@pytest.mark.parametrize("wrong", ["--name=a b", "--uuid=1"])
+def test_whose_command_it_is_must_be_known(wrong: str) -> None:
+    key = wrong.partition("=")[0]
+    command = runner_command("/usr/bin/python3", OPTIONS)
+    command = [wrong if one.startswith(f"{key}=") else one for one in command]
+    with pytest.raises(DoraSystemdError):
+        known_options_from_command(command)
+    with pytest.raises(DoraSystemdError, match="missing"):
+        known_options_from_command([one for one in command if one != wrong])
 
 
 def test_reading_options_is_cheap() -> None:

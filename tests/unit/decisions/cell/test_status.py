@@ -52,6 +52,7 @@ cells = st.builds(
     *(counts, st.booleans()),
     st.dictionaries(ids, st.builds(Sign, st.text(max_size=MAX_STATUS), times, times)),
     st.dictionaries(ids, st.lists(st.none() | counts, max_size=3).map(tuple)),
+    st.sampled_from(["", "0.1.0", "1.0~rc1+git-2"]),
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(),
@@ -72,7 +73,13 @@ def test_keys_of_a_newer_runner_are_left_aside() -> None:
 
 
 def test_missing_keys_have_defaults() -> None:
-    assert CellStatus.from_json("{}") == CellStatus()
+    assert CellStatus.from_json("{}") == CellStatus(version="")
+
+
+@pytest.mark.parametrize("version", ["x", "1\n", "1" * 41, "1 2", "\u0661", 1])
+def test_a_version_that_cannot_be(version: object) -> None:
+    with pytest.raises(DoraSystemdError, match="its version is"):
+        CellStatus.from_json(json.dumps({"version": version}))
 
 
 @given(json_values)

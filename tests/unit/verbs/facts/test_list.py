@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd import __version__
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
@@ -25,6 +26,7 @@ from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import dataflow_row, read_rows, table_rows
 from dora_systemd.verbs.facts.reading import read_dataflow, read_status
 from dora_systemd.verbs.list import find_row
+from dora_systemd.verbs.stop import stop_cells
 from dora_systemd.verbs.top import read_snapshot
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
@@ -69,6 +71,28 @@ def write_status(scope: Scope, status: CellStatus, name: str = "robot") -> None:
     directory = scope.cell_directory(name)
     directory.mkdir(parents=True)
     (directory / "status.json").write_text(status.to_json())
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_a_dataflow_of_another_version_says_so(scope: Scope) -> None:
+    manager = FakeManager()
+    unit = manager.add(options(), ControlGroup=GROUP)
+    write_status(scope, CellStatus(UUID, stage="running"))
+    assert row_of(manager, scope).upgrade == ("", "")
+    table = scope.cell_directory("robot") / "status.json"
+    table.write_text(CellStatus(UUID, stage="running", version="0.0.9").to_json())
+    (row,) = table_of(manager, scope)
+    line = f"Version:  runs 0.0.9, {__version__} is installed: doractl restart robot"
+    assert line in format_dataflow(row)
+    command = manager.units[unit]["ExecStart"][0][1]
+    command.insert(-1, "--colour=red")
+    (row,) = read_rows(manager, scope)
+    assert row.status == "Running"
+    assert "another version has started it" in format_dataflow(row)
+    assert "unknown argument '--colour=red': doractl stop robot, then" in format_dataflow(row)
+    (cell,) = read_cells(manager)
+    (outcome,) = stop_cells(manager, scope, [cell])
+    assert outcome.text == f"Dataflow stopped: {UUID} (robot)"
 
 
 @pytest.mark.parametrize(
