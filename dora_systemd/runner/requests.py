@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from dora_systemd.adapters.runner_socket.client import Request, refused_reply
+from dora_systemd.adapters.runner_socket.client import Request, refused_reply, unknown_request
 from dora_systemd.adapters.runner_socket.listener import Answer
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.status import (
@@ -144,7 +144,7 @@ class NodeRequests:
         what, node = request.get("what"), str(request.get("node"))
         by, grace = str(request.get("by") or _UNKNOWN_CALLER), request.get("grace")
         if what not in (RESTART, STOP) or not (grace is None or type(grace) is int):
-            raise DoraSystemdError(f"cannot do {quoted(str(request))}", "", ExitCode.USAGE)
+            raise unknown_request(request)
         run = self._reloader.run
         if run is None:
             raise _not_running("no node runs")

@@ -18,10 +18,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from dora_systemd import __version__
 from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator, parse_token
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.sockets import connect_unix, plain
-from dora_systemd.values import as_mapping
+from dora_systemd.values import as_mapping, quoted
 
 Request = Mapping[str, Any]
 MAX_BYTES = 1 << 16
@@ -63,6 +64,13 @@ def ask_refusal(path: Path) -> DoraSystemdError | None:
 def refused_reply(error: DoraSystemdError | None) -> dict[str, Any]:
     """The answer that ask_refusal() reads."""
     return {"refused": error_reply(error) if error else None}
+
+
+def unknown_request(request: Request) -> DoraSystemdError:
+    """The error for a request that this runner does not know: another doractl has sent it."""
+    told = f"cannot do {quoted(str(request))}: the runner is of dora-systemd {__version__}"
+    hint = "doractl restart NAME starts the installed version"
+    return DoraSystemdError(told, hint, ExitCode.USAGE)
 
 
 def error_reply(error: DoraSystemdError) -> dict[str, Any]:

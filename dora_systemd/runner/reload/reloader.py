@@ -15,6 +15,7 @@ from typing import Any
 
 from dora_systemd.adapters.dora.preparation import Prepared, resolved
 from dora_systemd.adapters.host.watch import Since, identity
+from dora_systemd.adapters.runner_socket.client import unknown_request
 from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -29,7 +30,6 @@ from dora_systemd.runner.reload.apply import Applier, Run, is_read
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.sources import Change, Sources, Versions, Watcher
 from dora_systemd.runner.reload.swap import NotReady, patience
-from dora_systemd.values import quoted
 
 PAUSE_SECONDS = 1.0
 """Minimum time between the beginnings of two reloads."""
@@ -318,7 +318,7 @@ class Reloader:
         if request.get("verb") == "hot-reload":
             return await self._switch(bool(request.get("on")))
         if request.get("verb") != "reload":
-            raise DoraSystemdError(f"cannot do {quoted(str(request))}", "", ExitCode.USAGE)
+            raise unknown_request(request)
         node = str(request.get("node") or "")
         changed = [] if node else await asyncio.to_thread(self._changed_since)
         try:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd import __version__
 from dora_systemd.adapters.dora.preparation import prepare
 from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.life import events as life
@@ -474,5 +475,6 @@ def test_what_is_asked_for_otherwise(tmp_path: Path) -> None:
         with pytest.raises(DoraSystemdError, match="cannot do ") as caught:
             await Bench(tmp_path).reloader.answer({"verb": "dance"})
         assert caught.value.code is ExitCode.USAGE
+        assert f"the runner is of dora-systemd {__version__}" in caught.value.message
 
     live(work)
