@@ -61,6 +61,7 @@ from dora_systemd.decisions.releases.progress import soaking
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.decisions.why.lives import find_lives, parse_happening
+from dora_systemd.decisions.why.stack import Crash, dump_frames, find_dump, python_frames
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import name_from_path, parse_name, parse_uuid
 from dora_systemd.terminal_text import one_line, shown_log, without_sequences
@@ -160,6 +161,15 @@ def _happenings(data: bytes) -> object:
     return find_lives([one for one in found if one is not None])
 
 
+def _stack(data: bytes) -> None:
+    text = text_of(data)
+    frames = [*dump_frames(text), *python_frames(text.split("\n")[::-1])]
+    assert all(len(f"{one.function}{one.place}") <= 240 for one in frames)
+    assert len(frames) <= 40
+    if isinstance(record := loaded(data), dict):
+        find_dump([record], "dora-a.service", Crash("a", 11, None, 0, 1))
+
+
 def _table(data: bytes) -> None:
     status = CellStatus.from_json(data)
     assert CellStatus.from_json(status.to_json()) == status
@@ -220,6 +230,7 @@ TARGETS = {
     "line-splitter": Target(_splitter),
     "line-encoder": Target(_encoder),
     "journal": Target(_happenings),
+    "stack": Target(_stack),
     "daemon-line": Target(lambda data: parse_daemon_line(text_of(data), 1)),
     "terminal": Target(_terminal),
     "check-versions": Target(lambda data: parse_versions(text_of(data))),

@@ -42,7 +42,7 @@ PYTEST = ("pytest", "--timeout=900")
 # A dataflow as a service, from start to stop: what to run after every change.
 QUICK = (
     *("cell", "start", "bus", "lab", "stop", "list", "kinds"),
-    *("start_refused", "start_run", "cli"),
+    *("start_refused", "start_run", "cli", "stack"),
 )
 
 
