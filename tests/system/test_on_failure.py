@@ -2,6 +2,7 @@
 
 import json
 import os
+import pwd
 import signal
 import time
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from dora_systemd.decisions.notice.unit import MOST_LINES
 from dora_systemd.errors import ExitCode
 from dora_systemd.names import notice_command_unit, notice_unit
 from tests.system.cells import Cell, Project, journalctl, run, wait_for
+from tests.system.releases import Releases, write_version
 
 # The units of notices are installed below /usr/local.
 pytestmark = pytest.mark.lab
@@ -236,3 +238,42 @@ def test_requests_of_a_hostile_runner(cell: Cell, project: Project) -> None:
     ends(cell)
     assert victim.exists()
     assert notices(project) == recorded(cell, "notice-sent") == []
+
+
+@pytest.mark.warns(*FAILS, "rolled back", "crashed", "exit code", "Failed to start")
+def test_a_release_is_rolled_back(releases: Releases, project: Project) -> None:
+    """The notice reports that, and not the failure that it was the answer to."""
+    flow(project)
+    write_version(project, "1")
+    releases.deploy(project.root, "--soak", "0s", *options(project))
+    good = releases.current()
+    write_version(project, "bad", "raise SystemExit(3)\n")
+    releases.deploy(project.root, "--soak", "0s", *options(project), status=11)
+    assert releases.running() == good
+    wait_for(
+        "the notice", lambda: "rolled-back" in [lines(one)["EVENT"] for one in notices(project)]
+    )
+    ends(releases.cell)
+    found = lines(notices(project)[-1])
+    assert "exit code 3" in found["CAUSE"]
+
+
+@pytest.mark.warns(*FAILS)
+def test_in_user_scope(project: Project) -> None:
+    """The user's manager starts it; nobody else has to do anything."""
+    path, root = flow(project), project.root
+    user = pwd.getpwuid(1000)
+    run("chown", "--recursive", user.pw_name, str(root))
+    own = ["setpriv", "--reuid=1000", "--regid=1000", "--init-groups", "env"]
+    own += ["XDG_RUNTIME_DIR=/run/user/1000", f"HOME={user.pw_dir}", "doractl", "--user"]
+    words = [f"--on-failure={root}/tell.sh", f"--env=OUT={root}/out"]
+    run(*own, "start", str(path), "--name", "mine", *words)
+    try:
+        project.write("crash", "")
+        (text,) = wait_for("the notice", lambda: notices(project))
+        found = lines(text)
+        assert (found["EVENT"], found["user"]) == ("node-given-up", user.pw_name)
+        assert found["EVIDENCE"] == "/run/user/1000/doranotice/mine/why.json"
+        assert json.loads(found["json"])["node"] == "source"
+    finally:
+        run(*own, "stop", "mine")

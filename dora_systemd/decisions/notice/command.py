@@ -50,12 +50,17 @@ def _check_unit(words: Sequence[str], unit: str) -> None:
         raise _refusal(words[0], "a failure must not start a unit of dora-systemd")
 
 
+def is_command(words: Words) -> bool:
+    """Whether they are the words of a command, and neither () nor a unit."""
+    return bool(words) and not words[0].startswith(UNIT)
+
+
 def unit_of(words: Words, name: str) -> str:
     """The unit that a notice of the dataflow `name` starts, or "" if it runs a command.
 
     A template gets the name of the dataflow as its instance.
     """
-    if not words or not words[0].startswith(UNIT):
+    if not words or is_command(words):
         return ""
     unit = words[0].removeprefix(UNIT)
     return unit.replace("@.service", f"@{name}.service")

@@ -119,8 +119,13 @@ def next_pause(last: Sent | None, now_us: int) -> int:
 
 
 def main_one(happened: Sequence[Happened]) -> Happened:
-    """The newest of the worst kind. happened: newest first, at least one."""
-    return min(happened, key=lambda one: ORDER.index(one.what))
+    """The newest of the worst kind. happened: newest first, at least one.
+
+    What came before a rollback is over: the former release runs again.
+    """
+    kinds = [one.what for one in happened]
+    count = kinds.index(_WORDS[ROLLED_BACK]) + 1 if _WORDS[ROLLED_BACK] in kinds else len(kinds)
+    return min(happened[:count], key=lambda one: ORDER.index(one.what))
 
 
 def summary(name: str, host: str, happened: Sequence[Happened], node: str = "") -> str:

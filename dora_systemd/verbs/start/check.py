@@ -31,9 +31,9 @@ _FORBIDDEN = 200
 """Exit statuses from this one on are systemd's own, see systemd.exec(5)."""
 _OF_RUNNERS = (
     *("Exec", "Restart", "StartLimit", "RuntimeDirectory", "Watchdog", "FileDescriptorStore"),
-    *("Delegate", "LogExtraFields", "Type", "Timeout", "OOMPolicy", "Notify"),
+    *("Delegate", "LogExtraFields", "Type", "Timeout", "OOMPolicy", "Notify", "OnFailure"),
 )
-"""Prefixes of the properties that only apply to a runner."""
+"""Prefixes of the properties that only apply to a runner: a failed check sends no notice."""
 
 
 def check_plan(connect: Callable[[], Manager], plan: Plan) -> dict[str, str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.notice.command import UNIT, Words, unit_of
+from dora_systemd.decisions.notice.command import Words, is_command, unit_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import notice_unit
 from dora_systemd.scope import Scope
@@ -22,7 +22,7 @@ def find_command(
 
     Raises DoraSystemdError for a program that this user cannot execute.
     """
-    if not words or words[0].startswith(UNIT):
+    if not is_command(words):
         return words
     path = words[0]
     if "/" in path:

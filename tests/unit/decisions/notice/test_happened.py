@@ -180,6 +180,18 @@ def test_the_worst_is_reported_and_all_are_counted() -> None:
     assert summary("robot", "lab", lone) == "robot on lab has given up node camera: exit code 1"
 
 
+def test_a_failure_before_a_rollback_is_over() -> None:
+    back, failed_, new = (
+        Happened("rolled-back", 8, 8, "sink", "node sink: exit code 2"),
+        Happened("failed", 7, 7, "sink", "node sink: exit code 2"),
+        Happened("failed", 9, 9),
+    )
+    assert main_one([back, failed_]) == back
+    assert main_one([new, back, failed_]) == new
+    text = "robot on lab has a release that was rolled back: node sink: exit code 2"
+    assert summary("robot", "lab", [back]) == text
+
+
 def test_environment_as_a_file() -> None:
     values = {"A": 'a "b" $c `d` \\e', "B": "", "C": "x # y ; z"}
     assert parse_environment_file(format_environment(values), "/x") == values

@@ -1,5 +1,7 @@
 """A dry run as root: a unit like the dataflow's, which runs the check and is forgotten."""
 
+from dataclasses import replace
+
 import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -24,6 +26,15 @@ def test_the_unit_of_a_check() -> None:
     assert "dora_systemd.runner.check" in manager.given["ExecStart"][0][1]
     for name in ("RuntimeDirectory", "Restart", "ExecStopPostEx", "WatchdogUSec", "LogExtraFields"):
         assert name not in manager.given
+
+
+def test_a_failed_check_starts_no_other_unit() -> None:
+    """OnFailure= of the dataflow would send a notice of a dataflow that runs."""
+    manager, plan = PrintingManager(), make_plan()
+    manager.units["doranotice@robot.service"] = {"LoadState": "loaded", "ActiveState": "inactive"}
+    options = plan.options._replace(on_failure=("/bin/tell",))
+    check_plan(lambda: manager, replace(plan, options=options))
+    assert "OnFailure" not in manager.given
 
 
 def test_what_a_check_refuses() -> None:
