@@ -19,6 +19,7 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.terminal import StageLine
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.inhibitors import format_holders
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
@@ -43,7 +44,7 @@ from dora_systemd.verbs.stop import (
     "--grace-duration",
     "Kill what still runs after 1.5 times this, if that is sooner than the dataflow's own.",
 )
-@click.option("-f", "--force", is_flag=True, help="Kill the nodes at once.")
+@click.option("-f", "--force", "--now", "force", is_flag=True, help="Kill the nodes at once.")
 @acting_options
 def command(
     selectors: tuple[str, ...], name: str | None, want_all: bool, grace_duration: int, force: bool
@@ -55,12 +56,15 @@ def command(
     terminal it asks before that, and before it stops one that doractl inhibit or a node inhibits.
     Without SELECTOR, a terminal is asked which one; the only one that runs is stopped.
 
+    A node with a `stop` in the settings has a time of its own, and may stop after others. Then one
+    Ctrl+C does not end the wait, and a second one kills what still runs, as --now does.
+
     Examples:
       doractl stop                                the one that runs, or asks
       doractl stop robot
       doractl stop 550e8400 vision
       doractl stop 'cam*' --grace-duration 2s
-      doractl stop robot --force
+      doractl stop robot --now
       doractl stop --all
     """
     if force and grace_duration != INFINITY:
@@ -139,6 +143,24 @@ def _stop(bus: Bus, scope: Scope, cells: list[Cell], most: int) -> int:
     cells = [*cells, *dependents]
     if most != INFINITY:
         return print_outcomes(stop_cells_within(bus, scope, cells, most))
-    with StageLine(sys.stderr) as stage:
-        outcomes = stop_cells(bus, scope, cells, partial(tell_stage, stage))
+    try:
+        outcomes = _wait(bus, scope, cells)
+    except KeyboardInterrupt:
+        if not any(one.known_options and one.known_options.by_node("stop") for one in cells):
+            raise
+        outcomes = _wait_on(scope, cells)
     return print_outcomes(outcomes)
+
+
+def _wait(bus: Bus, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
+    with StageLine(sys.stderr) as stage:
+        return stop_cells(bus, scope, cells, partial(tell_stage, stage))
+
+
+def _wait_on(scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
+    """Wait for a stop that may save data; kill what still runs after another Ctrl+C."""
+    tell("doractl: the stop continues; Ctrl+C again kills the nodes that still run", err=True)
+    try:
+        return _wait(Bus(scope), scope, cells)
+    except KeyboardInterrupt:
+        return stop_cells_within(Bus(scope), scope, cells, 0)

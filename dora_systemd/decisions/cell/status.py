@@ -110,6 +110,8 @@ class CellStatus(NamedTuple):
     is_first: bool = False  # whether NRestarts= of the unit is certainly 0
     # of nodes with a notify socket, for parse_sign() of dora_systemd.decisions.watchdog.messages
     signs: Mapping[str, tuple[Any, ...]] = {}
+    # of nodes that stop: CLOCK_MONOTONIC µs at which their time is over
+    stop_dues: Mapping[str, int] = {}
     # of nodes on other machines, for parse_use() of dora_systemd.decisions.machines.usage
     usage: Mapping[str, Sequence[Any]] = {}
     version: str = __version__  # of the dora-systemd that wrote it, or "" of a version before
@@ -130,6 +132,7 @@ class CellStatus(NamedTuple):
             for one in self.samples
         ]
         values["lines"] = {**self.lines}
+        values["stop_dues"] = {**self.stop_dues}
         values["usage"] = {**self.usage}
         return json.dumps(values)
 
@@ -185,6 +188,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         up_us=_number(known, "up_us"),
         is_first=known.get("is_first") is True,
         signs=_by_node(known.get("signs", {}), tuple),
+        stop_dues=_by_node(known.get("stop_dues", {}), lambda one: _numbers([one], 1)[0]),
         usage=_by_node(known.get("usage", {}), tuple),
         version=_version(known),
     )

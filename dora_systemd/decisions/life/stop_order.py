@@ -18,6 +18,7 @@ from dora_systemd.decisions.life.states import (
     Cell,
     EndNode,
     GiveTime,
+    Record,
     StopNode,
     StopStep,
 )
@@ -70,7 +71,8 @@ def overdue(cell: Cell, event: life.NodeOverdue) -> Next:
     after = StopStep.TERMINATED if step is StopStep.STOPPED else StopStep.KILLED
     cell = replace(cell, ending={**cell.ending, event.node: after})
     if after is StopStep.TERMINATED:
-        return cell, (EndNode(event.node, after=cell.grace // 2),)
+        late = Record("node-stop-late", event.node)
+        return cell, (late, EndNode(event.node, after=cell.grace // 2))
     cell, more = advance(cell)
     return cell, (EndNode(event.node), *more)
 

@@ -76,6 +76,9 @@ EVENTS = {
     "node-watchdog": EventKind(
         "5bec2bc650014ae7bb1424da4204438f", ERR, "Node {node} is ended by its watchdog"
     ),
+    "node-stop-late": EventKind(
+        "dcee148c33f9474391d52960af3b00c4", WARNING, "Node {node} has not stopped in its time"
+    ),
     "notify-refused": EventKind(
         "1bd51be61e0640ab97f9b364c5014cf0",
         WARNING,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from dora_systemd.decisions.needs.waiting import format_wait
-from dora_systemd.decisions.views.facts import SILENT
+from dora_systemd.decisions.views.facts import SILENT, stopping_words
 from dora_systemd.decisions.views.formats import (
     UNKNOWN,
     format_count,
@@ -161,7 +161,7 @@ def format_dataflows(
     """The table of `doractl list`, for a terminal of that width.
 
     With RELEASE if any of them is deployed, with ENDED if any has ended, and with WHY if any has
-    ended, waits or is degraded.
+    ended, waits, is degraded, or stops and has nodes with times of their own.
     """
     return format_table(*dataflow_table(rows), width, want_colors)
 
@@ -172,7 +172,7 @@ def dataflow_table(rows: Sequence[DataflowRow]) -> tuple[Sequence[str], list[Seq
     optional = {
         "RELEASE": any(row.release for row in rows),
         "ENDED": not all(map(is_up_word, rows)),
-        "WHY": any(row.status in _WITH_WHY or not is_up_word(row) for row in rows),
+        "WHY": any(map(_has_why, rows)),
     }
     header = [*_HEADER, *(title for title, is_shown in optional.items() if is_shown)]
     cells = [_dataflow_cells(row, prefixes[row.uuid]) for row in rows]
@@ -199,8 +199,15 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> dict[str, str]:
 _WITH_WHY = (WAITING, DEGRADED)
 
 
+def _has_why(row: DataflowRow) -> bool:
+    is_stopping = row.status == STOPPING and stopping_words(row.nodes)
+    return row.status in _WITH_WHY or not is_up_word(row) or bool(is_stopping)
+
+
 def _why(row: DataflowRow) -> str:
     """Format how the dataflow ended, what it waits for, or which nodes have failed."""
+    if row.status == STOPPING:
+        return stopping_words(row.nodes)
     if row.status == DEGRADED:
         failed = (one for one in row.nodes if one.word == FAILED)
         return ", ".join(f"node {one.node}: {one.exit}" for one in failed)

@@ -11,7 +11,7 @@ from dora_systemd.decisions.views.dataflows import (
     format_table,
     is_up_word,
 )
-from dora_systemd.decisions.views.facts import node_table
+from dora_systemd.decisions.views.facts import node_table, stopping_words
 from dora_systemd.decisions.views.formats import (
     UNKNOWN,
     format_count,
@@ -72,7 +72,8 @@ def _restart_words(row: DataflowRow) -> str:
 
 
 def _status_words(row: DataflowRow) -> str:
-    return f"{row.status} ({row.text})" if row.text else row.status
+    text = stopping_words(row.nodes) or row.text
+    return f"{row.status} ({text})" if text else row.status
 
 
 def _cpu_words(row: DataflowRow) -> str:

@@ -57,6 +57,7 @@ class NodeRow(NamedTuple):
     # watchdog, sign_age: the time in which it must send WATCHDOG=1, and how long ago it did, in µs
     watchdog: int | None = None
     sign_age: int | None = None
+    stop_left: int | None = None  # µs that it has to stop, None if it does not stop, or unknown
     essential: bool | None = None  # whether its final failure ends the dataflow
     scheduling: str = ""  # as in the settings, or ""
     cpus: str = ""  # those that it may use, "" if the settings name none
@@ -187,6 +188,8 @@ NODE_FACTS = (
     Fact("since", told=lambda one: one.since_us, is_moment=True,
         metric="ready_time_seconds", help="When it became ready, in Unix time.", samples=_ready),
     Fact("text", column="STATUS TEXT", cell=lambda row: row.text, has=lambda row: row.text, rank=2),
+    Fact("stop_left_us", "stop_left",
+        metric="stop_left_seconds", help="Time that it has to stop."),
     Fact("watchdog_us", "watchdog", column="WATCHDOG", cell=_watchdog, has=_watchdog, rank=1,
         metric="watchdog_seconds", help="Time in which it must send WATCHDOG=1."),
     Fact("watchdog_age_us", "sign_age",
@@ -204,6 +207,16 @@ NODE_FACTS = (
         help="Time since the last message of an owed output.", samples=_ages),
 )  # fmt: skip
 _TOLD = [(one.field or one.key, one.told) for one in NODE_FACTS if one.told]
+
+
+def stopping_words(rows: Sequence[NodeRow]) -> str:
+    """Format what the stop waits for: "recorder: writing episode 12, 41 s left"."""
+    parts = (
+        f"{one.node}{one.text and f': {one.text}'}, {round(one.stop_left / SECOND)} s left"
+        for one in rows
+        if one.stop_left is not None
+    )
+    return "; ".join(parts)
 
 
 def node_row(node: str, status: "NodeStatus | None", known: Mapping[str, Any]) -> NodeRow:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES
 from dora_systemd.decisions.resources.usage import WHOLE_CELL, format_waits
 from dora_systemd.decisions.views.dataflows import format_table, node_count
-from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.decisions.views.facts import NodeRow, stopping_words
 from dora_systemd.decisions.views.formats import (
     UNKNOWN,
     format_count,
@@ -87,7 +87,8 @@ def _rows(entry: TopEntry, look: Look, by: str, is_reversed: bool) -> list[TopRo
     nodes = (
         list(row.nodes) if by == "name" else sorted(row.nodes, key=lambda one: -_amount(one, by))
     )
-    state = f"{row.status} {node_count(row)}".rstrip()
+    stops = stopping_words(row.nodes)
+    state = f"{row.status} {f'({stops})' if stops else node_count(row)}".rstrip()
     first = (row.name, state, format_uptime(row.uptime), *_numbers(row, entry.waits, WHOLE_CELL))
     return [
         TopRow(row.uuid, row.name, "", row.status, first),

@@ -301,6 +301,9 @@ def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
 
 def _killed_at_stop(life: Life) -> str:
     """The nodes that had not ended when their time was up."""
+    late = list(dict.fromkeys(one.node for one in life.all("node-stop-late")))
+    if late:
+        return f"; not stopped in their time: {', '.join(late)}"
     begin = life.last("dataflow-stopping")
     exits = (one for one in life.all("node-exited") if begin and one.at_us >= begin.at_us)
     nodes = [one.node for one in exits if parse_exit(one.detail("exit")) == KILLED]

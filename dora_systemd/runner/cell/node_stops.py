@@ -45,6 +45,7 @@ class NodeStops:
         self._loop = asyncio.get_running_loop()
         self._began_us: int | None = None
         self._timers: dict[str, asyncio.TimerHandle] = {}
+        nodes.stop_dues.clear()  # of the run before
         if nodes.notify_sockets:
             nodes.notify_sockets.on_extend = self.extend
 
@@ -59,6 +60,8 @@ class NodeStops:
                 self._end(action)
             case GiveTime():
                 self._give(action)
+        if not isinstance(action, GiveTime):  # that can come very often
+            self._pump.refresh()
 
     def _begin(self) -> None:
         if self._began_us is None:

@@ -239,6 +239,7 @@ class Pump:
     def _write_table(self) -> None:
         own, lines, signs = self._life, self._pipes.line_counts(), self._nodes.signs()
         table = cell_status(self.cell, own.uuid, self._samples, lines, signs)
+        table = table._replace(stop_dues=self._nodes.stop_dues)
         table = self.amend(table._replace(up_us=own.up_us, is_first=own.is_first))
         try:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)

@@ -148,6 +148,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                     **(_numbers(use[node], samples, now, node) if node in use else {}),
                     **away.get(node, {}),
                     **_signs(status, node, now.at_us),
+                    **_stop_left(status, node, now.at_us),
                     **_right_facts(rights, node),
                     "cpus": _cpus(reading, node),
                     "outputs": _outputs(reading, node),
@@ -201,6 +202,13 @@ def _signs(status: CellStatus, node: str, now_us: int) -> dict[str, Any]:
     from dora_systemd.decisions.watchdog.messages import parse_sign, sign_facts
 
     return sign_facts(parse_sign(status.signs[node]), now_us)
+
+
+def _stop_left(status: CellStatus, node: str, now_us: int) -> dict[str, Any]:
+    """The fields of a row about the stop of a node that has a time of its own."""
+    due = status.stop_dues.get(node)
+    is_there = node in status.nodes and status.nodes[node].pid
+    return {"stop_left": max(due - now_us, 0)} if due and is_there else {}
 
 
 def _numbers(

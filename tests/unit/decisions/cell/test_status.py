@@ -51,6 +51,7 @@ cells = st.builds(
     st.dictionaries(ids, st.builds(LineCount, counts, counts, counts)),
     *(counts, st.booleans()),
     st.dictionaries(ids, st.builds(Sign, st.text(max_size=MAX_STATUS), times, times)),
+    st.dictionaries(ids, counts),
     st.dictionaries(ids, st.lists(st.none() | counts, max_size=3).map(tuple)),
     st.sampled_from(["", "0.1.0", "1.0~rc1+git-2"]),
 )

@@ -15,6 +15,7 @@ from dora_systemd.decisions.life.states import (
     EndNode,
     GiveTime,
     NodeAction,
+    Record,
     RunnerExit,
     State,
     StopNode,
@@ -113,6 +114,7 @@ def test_whatever_ends_the_dataflow_keeps_the_order(event: life.Event) -> None:
 
 def test_a_node_that_does_not_end_gets_sigterm_then_sigkill() -> None:
     now, _ = after(cell(), STOP, exited("arm"))
+    assert Record("node-stop-late", "camera") in step(now, life.NodeOverdue(1, "camera"))[1]
     now, done = after(now, life.NodeOverdue(1, "camera"))
     assert done == [EndNode("camera", after=HALF)]
     now, done = after(now, life.NodeOverdue(1, "camera"))

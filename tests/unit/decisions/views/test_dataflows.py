@@ -102,6 +102,22 @@ ENDED = ROWS[1]._replace(
 )
 
 
+def test_what_a_stop_waits_for() -> None:
+    camera, detector = ROWS[0].nodes
+    nodes = (camera._replace(text="writing episode 12", stop_left=41_400_000), detector)
+    stopping = ROWS[0]._replace(status="Stopping", nodes=nodes)
+    words = "camera: writing episode 12, 41 s left"
+    assert f"\nStatus:   Stopping ({words})\n" in format_dataflow(stopping)
+    header, line = format_dataflows([stopping]).splitlines()
+    assert header.split()[-1] == "WHY"
+    assert line.endswith(words)
+    quiet = stopping._replace(nodes=(nodes[0]._replace(text=""), detector))
+    assert "Stopping (camera, 41 s left)" in format_dataflow(quiet)
+    usual = stopping._replace(nodes=(camera, detector))
+    assert "WHY" not in format_dataflows([usual])
+    assert "Stopping (2/2 nodes running)" in format_dataflow(usual)
+
+
 def test_table_with_what_has_ended() -> None:
     rows = [ROWS[0], ENDED, ROWS[1]._replace(uuid=C, status="Stopped")]
     header, up, failed, stopped = format_dataflows(rows).splitlines()

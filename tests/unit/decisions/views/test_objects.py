@@ -33,13 +33,13 @@ def test_zero_is_not_unknown() -> None:
 def test_each_value_of_a_node_is_under_its_key() -> None:
     row = NodeRow("a", "running", pid=7, exit="exit code 1", text="hot", machine="gpu")
     row = row._replace(needs="/dev/x", watchdog=5, sign_age=3, max_restarts=2, essential=True)
-    row = row._replace(scheduling="fifo:5", cpus="2-3", silent="no image for 2s")
+    row = row._replace(scheduling="fifo:5", cpus="2-3", silent="no image for 2s", stop_left=9)
     (node,) = dataflow_object(UNKNOWN._replace(nodes=(row,)))["nodes"]
     assert {key: node[key] for key in node if node[key] is not None} == {
         **{"node": "a", "state": "running", "machine": "gpu", "pid": 7, "exit": "exit code 1"},
         **{"waits_for": "/dev/x", "text": "hot", "watchdog_us": 5, "watchdog_age_us": 3},
         **{"max_restarts": 2, "essential": True, "scheduling": "fifo:5", "cpus": "2-3"},
-        **{"silent": "no image for 2s", "outputs": []},
+        **{"silent": "no image for 2s", "outputs": [], "stop_left_us": 9},
     }
 
 

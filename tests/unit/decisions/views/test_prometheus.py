@@ -120,6 +120,13 @@ def test_signs_of_life() -> None:
     assert len(found["dora_node_watchdog_age_seconds"].samples) == 1, "plot has no watchdog"
 
 
+def test_the_time_left_of_a_stop() -> None:
+    camera, plot = ROBOT.row.nodes
+    row = ROBOT.row._replace(nodes=(camera._replace(stop_left=SECOND), plot))
+    found = families(replace(ROBOT, row=row))
+    assert [one.value for one in found["dora_node_stop_left_seconds"].samples] == [1]
+
+
 def test_what_is_special_about_a_node() -> None:
     nodes = (
         NodeRow("camera", "running", essential=True, scheduling="fifo:50", cpus="2-3"),

@@ -206,6 +206,12 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         *("Stopped", Cause.STOPPED, ""),
         f"stopped by {UNKNOWN_PERSON}; killed after the grace duration: deaf",
     ),
+    "stopped, and a node used up its own time": (
+        (*RUNS, JOB, STOPPED[0], event("node-stop-late", "recorder"),
+         event("node-exited", "recorder", exit="signal SIGKILL"), STOPPED[1]),
+        *("Stopped", Cause.STOPPED, ""),
+        f"stopped by {UNKNOWN_PERSON}; not stopped in their time: recorder",
+    ),
     "stopped with its terminal": (
         (*RUNS, event("dataflow-stopping", by="terminal"), event("dataflow-stopped")),
         *("Stopped", Cause.STOPPED, ""),

@@ -39,6 +39,7 @@ class Side:
         self.hangs = False
         self.resources = SimpleNamespace(look=lambda *_: [])
         self.notify_sockets = None
+        self.stop_dues: dict[str, int] = {}
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         def call(*_: Any) -> Any:
