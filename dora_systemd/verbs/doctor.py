@@ -48,8 +48,6 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
-from dora_systemd.trust.programs import account_from
-from dora_systemd.trust.sight import sight_of
 from dora_systemd.trust.socket_table import TABLES, listening_sockets
 from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
@@ -60,7 +58,7 @@ from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.logins import PASSWD, is_lingering, judge_logins, linger_command
-from dora_systemd.verbs.start.programs import version_trouble
+from dora_systemd.verbs.start.programs import version_trouble_of
 from dora_systemd.verbs.start.read import config_files
 from dora_systemd.verbs.start.settings import check_config
 from dora_systemd.verbs.start.where import DEFAULT_USER
@@ -261,12 +259,9 @@ def _versions(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
         text, remedy = dataflow_row(manager, scope, cell).upgrade
         if text:
             yield Finding("versions", State.NOTE, f"{cell.name}: {text}", remedy)
-        user = manager.read(cell.unit, ["User"])["User"]
-        account = account_from(pwd.getpwnam(user)) if user else None
-        with sight_of(account) as sight:
-            text, remedy = version_trouble(cell.options.venv, cell.options.dora, sight)
-            if text:
-                yield Finding("versions", State.WARNING, f"{cell.name}: {text}", remedy)
+        text, remedy = version_trouble_of(manager, cell)
+        if text:
+            yield Finding("versions", State.WARNING, f"{cell.name}: {text}", remedy)
 
 
 def _coredumps(_scope: Scope, root: Path) -> Iterator[Finding]:

@@ -9,11 +9,18 @@ import click
 from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
-from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
+from dora_systemd.cli.parameters import (
+    acting_options,
+    current_scope,
+    print_outcomes,
+    print_warnings,
+    tell,
+)
 from dora_systemd.cli.terminal import StageLine
 from dora_systemd.verbs.facts.cells import refuse_parts
 from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.restart import restart_cells
+from dora_systemd.verbs.start.programs import version_warnings
 from dora_systemd.verbs.start.restart_ended import find_known
 from dora_systemd.verbs.stop import find_dependents, format_dependents
 
@@ -48,6 +55,8 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
             from dora_systemd.verbs.start.start import restart_asked
 
             outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]
+    done = [cell for cell, one in zip(cells, outcomes, strict=False) if not one.problem]
+    print_warnings(version_warnings(bus, done))
     if any(one.problem for one in outcomes):
         from dora_systemd.cli.last_words import with_last_words
 

@@ -6,9 +6,11 @@ in another user's home, or on the machine that the project was copied from.
 
 import os
 import pwd
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path, PurePath
 
+from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import OLDEST_DORA, version_numbers
 from dora_systemd.decisions.cell.programs import (
     elf_machine,
@@ -18,8 +20,10 @@ from dora_systemd.decisions.cell.programs import (
     wheel_version,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.sight import Sight
+from dora_systemd.trust.programs import account_from
+from dora_systemd.trust.sight import Sight, sight_of
 from dora_systemd.values import shown
+from dora_systemd.verbs.facts.cells import Cell
 
 _PACKAGE = "/usr/lib/dora-cli/"
 """The directory where the package dora-cli has the metadata of its wheel."""
@@ -128,6 +132,25 @@ def _wheel(prefix: str, wheel: str, sight: Sight) -> str:
         if version := wheel_version(names, wheel):
             return version
     return ""
+
+
+def version_trouble_of(manager: Manager, cell: Cell) -> tuple[str, str]:
+    """Return what version_trouble() returns for a loaded dataflow, as the user of its nodes."""
+    if not cell.options.venv:
+        return "", ""
+    user = manager.read(cell.unit, ["User"])["User"]
+    with sight_of(account_from(pwd.getpwnam(user)) if user else None) as sight:
+        return version_trouble(cell.options.venv, cell.options.dora, sight)
+
+
+def version_warnings(manager: Manager, cells: Iterable[Cell]) -> Iterator[str]:
+    """Warn of dataflows that run, and whose nodes have another dora than their daemon."""
+    for cell in cells:
+        # A version that no daemon takes is an error of the start, or of the node.
+        with suppress(DoraSystemdError, KeyError):
+            text, remedy = version_trouble_of(manager, cell)
+            if text:
+                yield f"{cell.name}: {text}: {remedy}"
 
 
 def version_trouble(venv: str | None, dora: str, sight: Sight) -> tuple[str, str]:

@@ -7,6 +7,7 @@ uninstall.txt by tests/deb.
 
 import shutil
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -45,8 +46,13 @@ def shell() -> Iterator[Shell]:
 
 
 def needs(path: Path) -> list[pytest.MarkDecorator]:
-    """The lab that a task needs."""
-    return [pytest.mark.vm] if "Needs memory limits." in path.read_text() else []
+    """The lab, and the module, that a task needs."""
+    text, has_module = path.read_text(), find_spec("watchfiles") is not None
+    without = pytest.mark.skipif(not has_module, reason="this lab has no watchfiles")
+    return [
+        *([pytest.mark.vm] if "Needs memory limits." in text else []),
+        *([without] if "Needs watchfiles." in text else []),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,8 @@ from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.doctor import JOURNALD, examine, guarded
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.start.programs import version_warnings
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
@@ -159,6 +161,8 @@ def test_nodes_with_another_dora(manager: FakeManager, scope: Scope, tmp_path: P
     finding = found(manager, scope)["versions"]
     assert finding.text == "robot: the nodes' dora is 1.0.1, the daemon is 1.1.0"
     assert finding.remedy.endswith("dora-rs==1.1.0")
+    (cell,) = read_cells(manager)
+    assert [*version_warnings(manager, [cell])] == [f"{finding.text}: {finding.remedy}"]
 
 
 def test_dataflows_of_another_version(manager: FakeManager, scope: Scope) -> None:
