@@ -5,6 +5,7 @@ Needs what `make deb` makes, in dist/, or the packages themselves with autopkgte
 
 import json
 import pwd
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -137,6 +138,16 @@ def test_manuals(page: str) -> None:
     assert sh(f"man --warnings {section} {name}").stderr == ""
     lint = sh(f"mandoc -T lint -W style {path} 2>/dev/null || :").stdout.splitlines()
     assert [line for line in lint if "referenced manual not found" not in line] == []
+
+
+PAGES = Path("/usr/share/doc/dora-systemd")
+
+
+def test_pages_link_what_is_there() -> None:
+    for page in (PAGES / "README.md", PAGES / "README.zh-CN.md", *PAGES.glob("docs/*.md")):
+        links = re.findall(r"\]\(([^)#:]+)[)#]", page.read_text())
+        assert [link for link in links if not (page.parent / link).exists()] == [], page
+    assert (PAGES / "docs/install.md").stat().st_mode & 0o777 == 0o644
 
 
 def test_both_users_start_the_robot(flows: dict[str, Path]) -> None:
