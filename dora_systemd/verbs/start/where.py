@@ -71,6 +71,18 @@ class Look:
         there = [one for one in places if one.startswith("/") and self._is_venv(one)]
         return self._usable(there, is_unbuilt)
 
+    def note_unused_venv(self, environment: Mapping[str, str]) -> str:
+        """Format a note about a VIRTUAL_ENV of the caller that the user cannot see, or "".
+
+        The text does not depend on what the caller can see, who may be root.
+        """
+        named = environment.get("VIRTUAL_ENV", "")
+        is_asked = self.settings[VENV] is None and named.startswith("/")
+        if not is_asked or self._is_venv(named):
+            return ""
+        who = f"user {self.user.pw_name} finds" if self.user else "you find"
+        return f"VIRTUAL_ENV={shown(named)} is not used: {who} no Python there"
+
     def _usable(self, venvs: Sequence[str], is_unbuilt: bool) -> str | None:
         """The first one whose Python the user can execute. Raises the error of the first other."""
         problems = []

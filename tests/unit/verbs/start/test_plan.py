@@ -98,7 +98,11 @@ def test_interpreter(project: Path) -> None:
     assert plan.environment["VIRTUAL_ENV"] == variable
     assert plan.environment["PATH"].startswith(f"{variable}/bin:")
     assert plan_of(project, {"VIRTUAL_ENV": variable}, venv=flag).options.venv == flag
-    assert plan_of(project, {"VIRTUAL_ENV": "/nowhere"}).options.venv == beside
+    assert plan.notes == ()
+    lost = plan_of(project, {"VIRTUAL_ENV": "/nowhere"})
+    assert lost.options.venv == beside
+    assert lost.notes == ("VIRTUAL_ENV=/nowhere is not used: you find no Python there",)
+    assert plan_of(project, {"VIRTUAL_ENV": "/nowhere"}, venv=flag).notes == ()
 
 
 def test_environment(project: Path) -> None:
