@@ -49,6 +49,9 @@ def build_previous(place: Path) -> list[Path]:
         control = tree / "DEBIAN/control"
         text = control.read_text()
         control.write_text(re.sub(r"^(Version: .*)$", r"\1~previous", text, flags=re.MULTILINE))
+        for module in tree.glob("usr/lib/python3/dist-packages/dora_systemd/__init__.py"):
+            code = module.read_text()
+            module.write_text(re.sub(r'(__version__ = "[^"]+)', r"\1~previous", code))
         run("dpkg-deb", "--root-owner-group", "-Znone", "--build", str(tree), str(built))
     return sorted(built.iterdir())
 

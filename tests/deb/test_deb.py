@@ -81,6 +81,16 @@ def last_words(user: str) -> str:
     return "\n".join(sh(f"doractl {look} 2>&1", user, check=False).stdout for look in looks)
 
 
+RESTART = "doractl restart robot"
+
+
+def running_version(user: str) -> str:
+    """What `list` says of the version that runs, "" if it is the installed one."""
+    listed = sh("doractl list robot", user).stdout
+    found = re.search(r"^Version: +(.*)$", listed, flags=re.MULTILINE)
+    return found[1] if found else ""
+
+
 def start(flows: dict[str, Path]) -> None:
     for user, flow in flows.items():
         sh(f"doractl start {flow} --name robot", user)
@@ -140,14 +150,16 @@ def test_manuals(page: str) -> None:
     assert [line for line in lint if "referenced manual not found" not in line] == []
 
 
-PAGES = Path("/usr/share/doc/dora-systemd")
-
-
-def test_pages_link_what_is_there() -> None:
-    for page in (PAGES / "README.md", PAGES / "README.zh-CN.md", *PAGES.glob("docs/*.md")):
+def test_pages_link_what_is_there(tmp_path: Path) -> None:
+    """In the package itself: images of containers leave /usr/share/doc out."""
+    (package,) = (one for one in packages.find_packages() if "dora-systemd_" in one.name)
+    sh(f"dpkg-deb --extract {package} {tmp_path}")
+    place = tmp_path / "usr/share/doc/dora-systemd"
+    pages = [*place.glob("README*.md"), *place.glob("docs/*.md")]
+    assert {"README.md", "README.zh-CN.md", "install.md"} <= {page.name for page in pages}
+    for page in pages:
         links = re.findall(r"\]\(([^)#:]+)[)#]", page.read_text())
         assert [link for link in links if not (page.parent / link).exists()] == [], page
-    assert (PAGES / "docs/install.md").stat().st_mode & 0o777 == 0o644
 
 
 def test_both_users_start_the_robot(flows: dict[str, Path]) -> None:
@@ -189,6 +201,9 @@ def test_upgrade_keeps_dataflows_running(tmp_path: Path, flows: dict[str, Path])
     this = packages.version()
     packages.install(packages.build_previous(tmp_path))
     assert packages.version() == f"{this}~previous"
+    for user in USERS:  # a runner newer than doractl
+        assert running_version(user) == f"runs {this}, {this}~previous is installed: {RESTART}"
+        sh("doractl node restart robot detector", user)
     sh("doractl enable robot && doractl restart robot")
     sh("doractl restart robot", "alice")
     sh(f"doractl deploy {flows['alice']} --name released --soak 0s", "alice")
@@ -197,12 +212,16 @@ def test_upgrade_keeps_dataflows_running(tmp_path: Path, flows: dict[str, Path])
     packages.install()
     assert packages.version() == this
     assert {cell: (all_pids(*cell), uuid(*cell)) for cell in cells} == before
+    for user in USERS:
+        assert running_version(user) == f"runs {this}~previous, {this} is installed: {RESTART}"
+    assert f"robot: runs {this}~previous" in sh("doractl doctor", check=False).stdout
     for user, name in cells:
         wait_for_plot(user, len(lines(user, "plot", name)), name)
         sh(f"doractl node restart {name} detector", user)
         wait_for_plot(user, len(lines(user, "plot", name)), name)
         assert main_pid(user, name) in before[user, name][0]
     sh("doractl restart robot && doractl disable robot")
+    assert running_version("root") == ""
     sh("doractl disable released && doractl stop released", "alice")
 
 
