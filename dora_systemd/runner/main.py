@@ -272,7 +272,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             wait_for_needs(run, own, reloader.definition, dialogue.spawn)
         dialogue.spawn("end with the last node", end_held(run))
         dialogue.spawn("report that it has started", tell_started(run, reloader.has_started))
-        if prepared.plan.options.owes:
+        if options.has("owes"):
             from dora_systemd.runner.owes.watch import watch_owes
 
             dialogue.spawn("watch what nodes owe", watch_owes(run, prepared, dora, dialogue))

@@ -11,7 +11,6 @@ from dora_systemd.adapters.host import files
 from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
 from dora_systemd.decisions.cell.launch import (
     LaunchPlan,
-    has_launcher,
     is_launched,
     launch_descriptor,
 )
@@ -19,9 +18,7 @@ from dora_systemd.decisions.cell.limits import check_nodes
 from dora_systemd.decisions.cell.line_rates import check_rates
 from dora_systemd.decisions.cell.needs import check_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owes import check_owes
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
-from dora_systemd.decisions.cell.rights import check_rights_nodes
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
     Dataflow,
@@ -68,7 +65,7 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
         _load_session(options, sight),
         environment,
     )
-    if options.owes:
+    if options.has("owes"):
         from dora_systemd.adapters.dora.probe import probe_python
 
         probe_python(plan)
@@ -94,9 +91,6 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
     check_nodes(options.node_limits, ids, dynamic)
     check_restart_nodes(options.node_restarts, ids)
-    launched = {node.id for node in dataflow.nodes if has_launcher(node)}
-    check_rights_nodes(options.node_rights, ids, launched)
-    check_owes(options.owes, dict(options.node_restarts), dataflow.nodes)
     if options.settings:
         from dora_systemd.decisions.settings.runner import check_settings
 

@@ -14,7 +14,7 @@ from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owes import base_of
+from dora_systemd.decisions.cell.owes import base_of, owes_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS
 from dora_systemd.decisions.cell.uv import Read, find_lock, uv_project
 from dora_systemd.decisions.descriptor.dataflow import BuildSession, Dataflow
@@ -154,7 +154,7 @@ def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
         return _restart_bounds(node)
     # dora does not restart nodes made of operators, nor dynamic nodes.
     is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
-    policy = base_of(options.restart, options.owes, node.id)
+    policy = base_of(options.restart, owes_of(options), node.id)
     if not is_restarted or policy.policy == "no":
         return {}
     own = node.backoff if options.restart.policy == "no" else {}  # it restarts by its owes alone

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from operator import attrgetter
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
@@ -35,10 +35,6 @@ from dora_systemd.values import (
     quoted,
 )
 
-if TYPE_CHECKING:  # few dataflows have any, and `list` loads this module
-    from dora_systemd.decisions.cell.owes import Owed
-    from dora_systemd.decisions.cell.rights import NodeRights
-
 RUNNER_MODULE = "dora_systemd.runner"
 DEFAULT_GRACE = 10 * SECOND
 """µs."""
@@ -46,6 +42,12 @@ _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 
 MODULES = {
+    "essential": "rights",
+    "lock_memory": "rights",
+    "nice": "limits",
+    "oom_score_adjust": "rights",
+    "owes": "owes",
+    "scheduling": "rights",
     "stop": "stops",
     "stop_limit": "stops",
 }
@@ -81,15 +83,13 @@ class RunnerOptions(NamedTuple):
     env_keys: tuple[str, ...] = ()  # names of the variables that override the descriptor's `env:`
     # rate limits of log lines, see dora_systemd.decisions.cell.line_rates
     log_rates: RateLimits = UNLIMITED
-    node_limits: tuple[NodeLimits, ...] = ()  # of single nodes, as node_rights
+    node_limits: tuple[NodeLimits, ...] = ()  # of single nodes
     restart: RestartPolicy = DEFAULT  # policy of nodes without one in the descriptor
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()  # policies of single nodes
     start_timeout: int = INFINITY  # µs for all nodes to become ready, or INFINITY
     reload: HotReload = DEFAULT_RELOAD  # files that cause a reload, and how nodes are replaced
     # nodes with a notify socket, see dora_systemd.decisions.watchdog.watchdogs
     watchdogs: Mapping[str, int] = {}
-    node_rights: "tuple[NodeRights, ...]" = ()
-    owes: "tuple[Owed, ...]" = ()  # outputs of nodes that have to come in time
     needs: tuple[NodeNeed, ...] = ()  # paths and interfaces that single nodes wait for
     settings: tuple[SettingText, ...] = ()  # see dora_systemd.decisions.settings
     placed: tuple[Placed, ...] = ()  # the nodes that run on other machines than the head
@@ -129,6 +129,11 @@ class RunnerOptions(NamedTuple):
             if one.node and one.key == key:
                 texts.setdefault(one.node, []).append(one.text)
         return {node: runner_setting(key).read(own) for node, own in texts.items()}
+
+    def without(self, *keys: str) -> "RunnerOptions":
+        """The options without values of these settings."""
+        assert MODULES.keys() >= {*keys}
+        return self._replace(settings=tuple(one for one in self.settings if one.key not in keys))
 
     def of_node(self, node: str, key: str) -> Any:
         """The value that a node has of the setting, or that of the dataflow."""
@@ -192,9 +197,6 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
     return call
 
 
-_parse_rights = _late("cell.rights", "parse_node_rights")
-_format_rights = _late("cell.rights", "format_node_rights")
-_parse_owed, _format_owed = (_late("cell.owes", name) for name in ("parse_owed", "format_owed"))
 _parse_words, _format_words = (
     _late("notice.command", name) for name in ("parse_words", "format_words")
 )
@@ -233,9 +235,7 @@ _OPTIONS = (
     _each("env-key", "env_keys"),
     Option("log-rate-limit", "log_rates", parse_rates, format_rates, is_repeated=True),
     _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
-    _each("node-rights", "node_rights", _parse_rights, _format_rights),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
-    _each("owes", "owes", _parse_owed, _format_owed),
     Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("needs", "needs", parse_node_need, "=".join),
     _each("set", "settings", parse_setting, format_setting),

@@ -1,16 +1,16 @@
 """What nodes owe: outputs on which a message has to come in time, and what happens if none does.
 
-They are part of the runner's command line, which `list` parses: it imports this module for a
-dataflow that has some.
+The setting is in decisions/settings/owes.py.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import check_known, did_you_mean
+from dora_systemd.names import did_you_mean
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 PROBE = "dora-systemd-probe"
@@ -106,6 +106,12 @@ def merge_owed(*given: Iterable[Owed]) -> tuple[Owed, ...]:
     return tuple({one.place: one for many in given for one in many}.values())
 
 
+def owes_of(options: RunnerOptions) -> tuple[Owed, ...]:
+    """The outputs that nodes owe. Raises DoraSystemdError."""
+    owes = options.by_node("owes")
+    return tuple(one._replace(node=node) for node, own in owes.items() for one in own)
+
+
 def owes_restart(owes: Iterable[Owed], node: str) -> bool:
     """Whether `node` is restarted if it is silent."""
     return any(one.node == node and one.then == RESTART for one in owes)
@@ -139,7 +145,6 @@ def check_owes(
     if not owes:
         return
     by_id = {node.id: node for node in nodes}
-    check_known("cannot watch the outputs of", (one.node for one in owes), by_id)
     for one in owes:
         node = by_id[one.node]
         _check_output(one, node)

@@ -1,7 +1,5 @@
 """The rights of single nodes, and the programs that set these rights. Pure.
 
-The runner's command line contains these rights, so this module imports only what loads quickly.
-
 The programs are those of util-linux and coreutils: prlimit(1), chrt(1), nice(1), taskset(1),
 choom(1). Each program sets one right, and executes the next program. The unit grants raised rights
 to all of its processes, see decisions/unit/properties.py. So programs for the other nodes take
@@ -16,8 +14,9 @@ from functools import reduce
 from operator import or_
 from typing import Any, NamedTuple
 
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import check_known, did_you_mean
+from dora_systemd.names import did_you_mean
 from dora_systemd.node_words import NodeWords, parse_node_words, refusal
 from dora_systemd.values import format_bool, parse_bool, quoted
 
@@ -158,6 +157,16 @@ def merge_node_rights(*sources: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
     return tuple(NodeRights(node, **reduce(or_, given)) for node, given in by_node.items())
 
 
+def rights_of(options: RunnerOptions) -> tuple[NodeRights, ...]:
+    """The rights of single nodes. Raises DoraSystemdError."""
+    named = dict.fromkeys(one.node for one in options.settings if one.node and one.key in BY_KEY)
+    found = {key: options.by_node(key) for key in BY_KEY} if named else {}
+    return tuple(
+        NodeRights(node, **{key: values[node] for key, values in found.items() if node in values})
+        for node in named
+    )
+
+
 def is_essential(rights: Iterable[NodeRights], node: str) -> bool:
     """Whether the final failure of `node` ends the dataflow."""
     return node in essential_nodes(rights)
@@ -168,27 +177,17 @@ def essential_nodes(rights: Iterable[NodeRights]) -> tuple[str, ...]:
     return tuple(one.node for one in rights if one.essential)
 
 
-def without_essential(rights: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
-    """The rights of nodes whose final failure ends nothing here."""
-    kept = (one._replace(essential=None) for one in rights)
-    return tuple(one for one in kept if given_rights(one))
-
-
 def has_process_rights(rights: Iterable[NodeRights]) -> bool:
     """Whether a program has to set something for a node before it runs."""
     return any(given_rights(one).keys() - {"essential", "oom_score_adjust"} for one in rights)
 
 
-def check_rights_nodes(
-    rights: Iterable[NodeRights], nodes: Iterable[str], launched: Container[str]
-) -> None:
+def check_rights_nodes(rights: Iterable[NodeRights], launched: Container[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for rights of a node that cannot have them.
 
-    nodes: all ids. launched: nodes that our launcher starts, which sets their rights.
+    launched: nodes that our launcher starts, which sets their rights.
     """
-    given = list(rights)
-    check_known("cannot give rights to", [one.node for one in given], nodes)
-    for one in given:
+    for one in rights:
         if one.node not in launched and given_rights(one).keys() - {"essential"}:
             message = f"cannot give rights to the node {quoted(one.node)}: something else starts it"
             hint = "what starts a dynamic or ROS 2 node gives it its rights"

@@ -5,7 +5,7 @@ machines, as far as nodes depend on them: variables, the sandbox, the grace dura
 other properties of the unit apply to the head; an entry of `machines:` has those of its machine.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
@@ -16,14 +16,12 @@ from dora_systemd.decisions.cell.options import (
     format_setting,
     runner_setting,
 )
-from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.machines.entry import Machine
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.owes import NOTIFY, WATCHDOG
 from dora_systemd.decisions.settings.resolve import SET, Settings
-from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.sandbox import SANDBOX
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
@@ -64,24 +62,14 @@ def on_head(options: RunnerOptions) -> RunnerOptions:
     return options._replace(
         head="",
         node_limits=tuple(one for one in options.node_limits if one.node not in away),
-        node_rights=tuple(_on_head(options.node_rights, away)),
         log_rates={key: one for key, one in options.log_rates.items() if key not in away},
         watchdogs=_without(options.watchdogs, away),
         settings=tuple(
             one
             for one in options.settings
-            if one.node not in away or runner_setting(one.key).only_head
+            if one.node not in away or runner_setting(one.key).on_head
         ),
     )
-
-
-def _on_head(rights: Iterable[NodeRights], away: set[str]) -> Iterator[NodeRights]:
-    """The head decides which failure ends the dataflow; the rest is for the machine of the node."""
-    for one in rights:
-        if one.node not in away:
-            yield one
-        elif one.essential:
-            yield NodeRights(one.node, essential=True)
 
 
 def _without(watchdogs: Watchdogs, away: set[str]) -> Watchdogs:
@@ -142,7 +130,7 @@ def _passed_on(settings: Sequence[SettingText], nodes: Sequence[str]) -> Iterato
     for one in settings:
         setting = runner_setting(one.key)
         is_for_them = one.node in nodes or (not one.node and setting.per_node)
-        if is_for_them and not setting.only_head:
+        if is_for_them and setting.on_members:
             yield one
 
 
@@ -169,7 +157,6 @@ def _directory(machine: Machine, options: RunnerOptions) -> str:
 def _of_nodes(options: RunnerOptions, nodes: Sequence[str]) -> Iterator[tuple[Setting[Any], Any]]:
     limits = {node: watchdog_of(options.watchdogs, node) for node in nodes}
     yield NODE_LIMIT, _about(options.node_limits, nodes)
-    yield NODE_RIGHTS, _about(options.node_rights, nodes)
     yield LOG_RATE_LIMIT, _rates(options.log_rates, nodes)
     yield WATCHDOG, {node: limit for node, limit in limits.items() if OFF < limit < INFINITY}
     if INFINITY in limits.values():

@@ -28,7 +28,6 @@ def own_options(options: RunnerOptions) -> RunnerOptions:
     """Return the options without those for nodes of other machines."""
     return options._replace(
         node_limits=tuple(one for one in options.node_limits if is_here(options, one.node)),
-        node_rights=tuple(one for one in options.node_rights if is_here(options, one.node)),
         needs=tuple(one for one in options.needs if is_here(options, one.node)),
         settings=tuple(
             one for one in options.settings if not one.node or is_here(options, one.node)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dora_systemd.decisions.cell.launch import is_launched
 from dora_systemd.decisions.cell.machines import HEAD, Placed, is_host_name, members_of
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owes import owes_of
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, Node, mapping_of
 from dora_systemd.decisions.machines.entry import DIRECT, Machine, parse_entry
@@ -221,7 +222,7 @@ def part(options: RunnerOptions, settings: Settings) -> RunnerOptions:
 
     Only the head watches owed outputs. Raises DoraSystemdError (BAD_INPUT) as spread().
     """
-    own = options._replace(owes=())
+    own = options.without("owes")
     _check(own, settings)
     return own
 
@@ -242,7 +243,7 @@ def _refused(options: RunnerOptions, settings: Settings) -> Iterator[tuple[str, 
     if (network := settings[NETWORK]) != DEFAULT_NETWORK:
         reason = f"the network is {network}, and machines meet in that of the host"
         yield reason, f"leave {NETWORK.flags[0]} out"
-    for one in options.owes:
+    for one in owes_of(options):
         if one.node in away:
             reason = f"node {one.node} is on machine {away[one.node]}, and owes an output"
             yield reason, "leave owes of this node out"

@@ -71,7 +71,13 @@ class Setting(Generic[T]):
     # whether a value, of a node or of the dataflow, gives more than the user of the dataflow has.
     # In system scope such a value is only valid where root_only settings are.
     raises: Callable[[Any], bool] | None = None
-    only_head: bool = False  # on several machines the head obeys it, also for nodes of the others
+    # on_head: of several machines the head obeys it also for nodes of its members; on_members: they
+    # obey it for their own nodes
+    on_head: bool = False
+    on_members: bool = True
+    # for a value for the dataflow that names nodes: what the runner gets instead, by node, "" for
+    # the dataflow, and by key. From the values that files give nodes, and the one for the dataflow.
+    by_node: Callable[[Mapping[str, Any], Any], Mapping[str, Mapping[str, Any]]] | None = None
     # raises DoraSystemdError (BAD_INPUT) for values in the options of a runner that these nodes of
     # the dataflow cannot have
     check: Callable[[RunnerOptions, Sequence[Node]], None] | None = None

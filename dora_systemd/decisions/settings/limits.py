@@ -14,6 +14,7 @@ from dora_systemd.decisions.cell.limits import (
 )
 from dora_systemd.decisions.cell.rights import is_negative, parse_nice
 from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text, texts_of_nodes
+from dora_systemd.decisions.settings.rights import check_rights
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
@@ -95,6 +96,7 @@ NICE = Setting[int | None](
     property="Nice",
     root_only=True,
     raises=is_negative,
+    check=check_rights,
 )
 REALTIME = Setting[str | None](
     "realtime",
@@ -133,3 +135,4 @@ LIVE_SETTINGS: tuple[Setting[Any], ...] = (
 """Settings that can be changed while the dataflow is running."""
 
 LIMIT_SETTINGS: tuple[Setting[Any], ...] = (*LIVE_SETTINGS, NICE, REALTIME, DEVICE)
+RUNNER_SETTINGS = {NICE.name: NICE}

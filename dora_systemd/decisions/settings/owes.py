@@ -1,10 +1,20 @@
 """The settings of what nodes owe: messages on outputs, and signs of life, see sd_notify(3)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import or_
 from typing import Any
 
-from dora_systemd.decisions.cell.owes import Owed, format_owed, merge_owed, owed_of, parse_owed
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owes import (
+    Owed,
+    check_owes,
+    format_owed,
+    merge_owed,
+    owed_of,
+    owes_of,
+    parse_owed,
+)
+from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.settings.kinds import (
     BOOL,
     Base,
@@ -27,7 +37,23 @@ def _parse(value: Any, _: Base) -> tuple[Owed, ...]:
 def _parse_one(value: Any) -> Owed:
     if isinstance(value, Mapping):
         return owed_of({key: scalar_text(one) for key, one in value.items()})
-    return parse_owed(scalar_text(value))
+    text = scalar_text(value)
+    # The form of format_owed() for an output without its node.
+    is_nameless = text.startswith("/")
+    return parse_owed(f"_{text}")._replace(node="") if is_nameless else parse_owed(text)
+
+
+def _check(options: RunnerOptions, nodes: Sequence[Node]) -> None:
+    check_owes(owes_of(options), dict(options.node_restarts), nodes)
+
+
+def _by_node(
+    nodes: Mapping[str, tuple[Owed, ...]], given: tuple[Owed, ...]
+) -> dict[str, dict[str, tuple[Owed, ...]]]:
+    found: dict[str, list[Owed]] = {}
+    for one in merged_owes(nodes, given):
+        found.setdefault(one.node, []).append(one._replace(node=""))
+    return {node: {"owes": tuple(owes)} for node, owes in found.items()}
 
 
 _OWED = Kind[tuple[Owed, ...]](
@@ -45,11 +71,14 @@ OWES = Setting[tuple[Owed, ...]](
     (),
     "Output on which messages must come in time; else restart the node, warn, or fail.",
     per_node=True,
+    on_members=False,
+    by_node=_by_node,
+    check=_check,
 )
 OWES_SETTINGS: tuple[Setting[Any], ...] = (OWES,)
 
 
-def owes_of(nodes: Mapping[str, tuple[Owed, ...]], given: tuple[Owed, ...]) -> tuple[Owed, ...]:
+def merged_owes(nodes: Mapping[str, tuple[Owed, ...]], given: tuple[Owed, ...]) -> tuple[Owed, ...]:
     """The outputs of `given`, which take precedence over those that a settings file has for nodes.
 
     Raises DoraSystemdError (BAD_INPUT) for one that names its node where the place does, or not
@@ -83,3 +112,4 @@ NOTIFY = Setting[bool](
     "notify", BOOL, False, "Give the nodes a notify socket, to report their STATUS=.", per_node=True
 )
 SIGN_SETTINGS: tuple[Setting[Any], ...] = (WATCHDOG, NOTIFY)
+RUNNER_SETTINGS = {OWES.name: OWES}

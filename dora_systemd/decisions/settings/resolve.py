@@ -9,6 +9,7 @@ from functools import reduce
 from pathlib import PurePath
 from typing import Any, TypeVar, cast
 
+from dora_systemd.decisions.cell.environment import changed
 from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_limits, node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
@@ -16,18 +17,15 @@ from dora_systemd.decisions.cell.needs import split_needs
 from dora_systemd.decisions.cell.options import MODULES, RunnerOptions, SettingText, parse_setting
 from dora_systemd.decisions.cell.owes import RESTART, base_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
-from dora_systemd.decisions.cell.rights import BY_KEY as RIGHTS
-from dora_systemd.decisions.cell.rights import NodeRights, merge_node_rights
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.on_failure import ON_FAILURE
-from dora_systemd.decisions.settings.owes import NOTIFY, OWES, WATCHDOG, owes_of
+from dora_systemd.decisions.settings.owes import NOTIFY, OWES, WATCHDOG, merged_owes
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
-from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.stops import STOP
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
@@ -65,6 +63,7 @@ class Settings:
     table: Sequence[Setting[Any]] = field(default=SETTINGS, repr=False)  # the existing settings
     # in system scope, environment files that only others than root name
     lent: frozenset[str] = frozenset()
+    passed: tuple[SettingText, ...] = ()  # on a member, from the head
 
     def __getitem__(self, setting: Setting[T]) -> T:
         return cast(T, self.values[setting.name])
@@ -98,7 +97,7 @@ def resolve_settings(
     precedence last. Raises DoraSystemdError: USAGE for flags and variables, BAD_INPUT for files.
     """
     documents = [(source, check_document(source, document, table)) for source, document in files]
-    texts = [parse_setting(text) for text in texts_of(flags.get(SET) or ())]
+    passed = tuple(parse_setting(text) for text in texts_of(flags.get(SET) or ()))
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for setting in table:
@@ -106,12 +105,10 @@ def resolve_settings(
             *_from_files(setting, reversed(documents)),
             *_from_variable(setting, environment),
             *_from_flag(setting, flags),
-            *_from_texts(setting, [one.text for one in texts if one[:2] == ("", setting.name)]),
         ]
         sources[setting.name], values[setting.name] = _merged(setting, given)
     nodes = _resolve_nodes(documents, table)
-    _add_texts(nodes, texts, table)
-    return Settings(values, sources, nodes, table)
+    return Settings(values, sources, nodes, table, passed=passed)
 
 
 def given_texts(
@@ -177,11 +174,6 @@ def _from_variable(
         yield setting.variable, _parsed(setting, value, setting.variable, base)
 
 
-def _from_texts(setting: Setting[Any], texts: Sequence[str]) -> Iterator[Given]:
-    if texts:
-        yield f"--{SET}", setting.read(texts)
-
-
 def _from_files(
     setting: Setting[Any], documents: Iterable[tuple[str, Mapping[str, Any]]]
 ) -> Iterator[Given]:
@@ -232,16 +224,6 @@ def _resolve_nodes(
     return nodes
 
 
-def _add_texts(
-    nodes: dict[str, dict[str, Any]], texts: Sequence[SettingText], table: Sequence[Setting[Any]]
-) -> None:
-    """Replace values in `nodes` by those of --set."""
-    for setting in table:
-        for node in dict.fromkeys(one.node for one in texts if one.node):
-            if own := [one.text for one in texts if one[:2] == (node, setting.name)]:
-                nodes.setdefault(node, {})[setting.name] = setting.read(own)
-
-
 _FIELDS = {
     setting.name: field
     for setting, field in zip(POLICY_SETTINGS, RestartPolicy._fields, strict=True)
@@ -258,26 +240,38 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
         log_rates=log_rates(settings),
         node_limits=settings_node_limits(settings),
-        node_rights=settings_node_rights(settings),
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
         watchdogs=watchdogs(settings),
         needs=split_needs(settings[NEEDS], settings.by_node(NEEDS))[1],
         reload=hot_reload(settings, options.working_directory),
-        owes=owes_of(settings.by_node(OWES), settings[OWES]),
-        settings=tuple(runner_texts(settings)),
+        settings=changed(tuple(_runner_texts(settings)), settings.passed),
         on_failure=settings[ON_FAILURE],
     )
 
 
-def runner_texts(settings: Settings) -> Iterator[SettingText]:
+def _runner_texts(settings: Settings) -> Iterator[SettingText]:
     """The settings that the runner receives as text, as far as they are given."""
+    table = {setting.name: setting for setting in settings.table}
+    for node, values in _by_node(settings).items():
+        for key, value in values.items():
+            yield from (SettingText(node, key, text) for text in table[key].kind.format(value))
+
+
+def _by_node(settings: Settings) -> dict[str, dict[str, Any]]:
+    """The values for the runner by node, "" for the dataflow, and by name of the setting."""
+    found: dict[str, dict[str, Any]] = {"": {}}
+    for node, values in settings.nodes.items():
+        found[node] = {key: value for key, value in values.items() if key in MODULES}
     for setting in settings.table:
-        if setting.name in MODULES:
-            given = {"": settings[setting]} if settings.is_given(setting) else {}
-            for node, value in {**given, **settings.by_node(setting)}.items():
-                yield from (SettingText(node, setting.name, t) for t in setting.kind.format(value))
+        if setting.by_node:
+            given = setting.by_node(settings.by_node(setting), settings[setting])
+            for node, own in given.items():
+                found.setdefault(node, {}).update(own)
+        elif setting.name in MODULES and not setting.property and settings.is_given(setting):
+            found[""][setting.name] = settings[setting]
+    return found
 
 
 def log_rates(settings: Settings) -> RateLimits:
@@ -306,17 +300,6 @@ def settings_node_limits(settings: Settings) -> tuple[NodeLimits, ...]:
     return merge_node_limits(of_files, given)
 
 
-def settings_node_rights(settings: Settings) -> tuple[NodeRights, ...]:
-    """The rights of all nodes: those of settings files, overridden by `node_rights`."""
-    given = settings[NODE_RIGHTS]
-    of_files = (
-        NodeRights(node, **{key: values[key] for key in values.keys() & RIGHTS})
-        for node, values in settings.nodes.items()
-        if values.keys() & RIGHTS
-    )
-    return merge_node_rights(of_files, given)
-
-
 def restart_policy(settings: Settings) -> RestartPolicy:
     """The policy of the dataflow, and of its nodes without one."""
     return with_values(DEFAULT, {_FIELDS[one.name]: settings[one] for one in POLICY_SETTINGS})
@@ -324,7 +307,7 @@ def restart_policy(settings: Settings) -> RestartPolicy:
 
 def node_policies(settings: Settings) -> tuple[tuple[str, RestartPolicy], ...]:
     """The policies of nodes in settings files, based on that of the dataflow."""
-    base, owes = restart_policy(settings), owes_of(settings.by_node(OWES), settings[OWES])
+    base, owes = restart_policy(settings), merged_owes(settings.by_node(OWES), settings[OWES])
     return tuple(
         (node, with_values(base_of(base, owes, node), {_FIELDS[key]: values[key] for key in given}))
         for node, values in settings.nodes.items()

@@ -1,22 +1,45 @@
 """The settings of rights that single nodes have, see dora_systemd.decisions.cell.rights."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dora_systemd.decisions.cell.launch import has_launcher
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import (
     BY_KEY,
     RIGHTS,
     NodeRights,
+    check_rights_nodes,
     format_node_rights,
+    given_rights,
     merge_node_rights,
     parse_node_rights,
     raises_rights,
+    rights_of,
 )
+from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.settings.kinds import BOOL, Kind, Setting, one_text, texts_of_nodes
 
 
-def _of_node(key: str, kind: Kind[Any], help_text: str, default: Any = None) -> Setting[Any]:
-    raises = BY_KEY[key].raises
-    return Setting(key, kind, default, help_text, only_nodes=True, raises=raises)
+def check_rights(options: RunnerOptions, nodes: Sequence[Node]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for rights of a node that cannot have them."""
+    check_rights_nodes(rights_of(options), {node.id for node in nodes if has_launcher(node)})
+
+
+def _of_node(
+    key: str, kind: Kind[Any], help_text: str, default: Any = None, on_head: bool = False
+) -> Setting[Any]:
+    return Setting(
+        *(key, kind, default, help_text),
+        only_nodes=True,
+        raises=BY_KEY[key].raises,
+        on_head=on_head,
+        check=check_rights,
+    )
+
+
+def _by_node(_: Mapping[str, Any], given: tuple[NodeRights, ...]) -> dict[str, dict[str, Any]]:
+    return {one.node: given_rights(one) for one in given}
 
 
 NODE_RIGHTS = Setting[tuple[NodeRights, ...]](
@@ -31,6 +54,7 @@ NODE_RIGHTS = Setting[tuple[NodeRights, ...]](
     (),
     f"Rights of one node: {', '.join(right.word for right in RIGHTS)}.",
     raises=lambda rights: any(map(raises_rights, rights)),
+    by_node=_by_node,
 )
 SCHEDULING: Setting[str | None] = _of_node(
     "scheduling",
@@ -50,7 +74,9 @@ ESSENTIAL: Setting[bool] = _of_node(
     BOOL,
     "The final failure of the node ends the dataflow, and its memory goes last.",
     False,
+    on_head=True,
 )
 RIGHTS_SETTINGS: tuple[Setting[Any], ...] = (
     *(NODE_RIGHTS, SCHEDULING, LOCK_MEMORY, OOM_SCORE_ADJUST, ESSENTIAL),
 )
+RUNNER_SETTINGS = {one.name: one for one in RIGHTS_SETTINGS[1:]}

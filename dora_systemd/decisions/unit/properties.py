@@ -14,7 +14,7 @@ from dora_systemd.decisions.cell.options import (
     reload_command,
     runner_command,
 )
-from dora_systemd.decisions.cell.rights import NICE_LIMIT, NodeRights
+from dora_systemd.decisions.cell.rights import NICE_LIMIT, NodeRights, rights_of
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.life.stop_budget import unit_timeout
 from dora_systemd.decisions.needs.units import NETWORK_UNIT, device_entries, needs_properties
@@ -87,7 +87,7 @@ def unit_properties(
         **log_properties(options, context),
         **(sandbox_properties(context.sandbox) if context.sandbox else {}),
         **realtime_properties(settings),
-        **rights_properties(options.node_rights),
+        **rights_properties(rights_of(options)),
         **needs_properties(settings[NEEDS], context.clock),
         **device_properties(options, context),
     }

@@ -15,6 +15,7 @@ from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN, keeps_core_dump
 from dora_systemd.decisions.cell.environment import find_python, node_environment, with_place
 from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.rights import rights_of
 from dora_systemd.paths import CellPaths
 
 _SIGACTIONS = {"x86_64": "13", "aarch64": "134", "riscv64": "134"}
@@ -128,7 +129,7 @@ def daemon_variables(
 
 
 def _rights(options: RunnerOptions, unit: Path) -> dict[str, str]:
-    if not options.node_rights and not any(map(has_cpus, options.node_limits)):
+    if not rights_of(options) and not any(map(has_cpus, options.node_limits)):
         return {}
     # Imported late: most dataflows have neither.
     from dora_systemd.runner.nodes.rights import launcher_rights

@@ -13,7 +13,7 @@ from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import is_probe
-from dora_systemd.decisions.cell.rights import is_essential
+from dora_systemd.decisions.cell.rights import is_essential, rights_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
@@ -168,7 +168,7 @@ class Dialogue(Tasks):
 
     def _is_own(self, node: str) -> bool:
         """Whether this runner has added the node, which the dataflow does not contain."""
-        return bool(self._options.owes) and is_probe(node)
+        return self._options.has("owes") and is_probe(node)
 
     def _hear(self, record: protocol.LogRecord) -> None:
         if self._is_own(record.node):
@@ -178,11 +178,11 @@ class Dialogue(Tasks):
             return
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
-            self._nodes.adopt(event.node, event.pid, self._options.node_rights)
+            self._nodes.adopt(event.node, event.pid, rights_of(self._options))
         if isinstance(event, life.NodeExited):
             node = self._pump.cell.nodes.get(event.node)
             is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
-            essential = is_essential(self._options.node_rights, event.node)
+            essential = is_essential(rights_of(self._options), event.node)
             oom = self._nodes.find_oom(event.node)
             event = life_events.with_facts(event, is_stale, oom, essential)
             if node is not None and not is_stale:

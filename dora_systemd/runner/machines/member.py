@@ -22,7 +22,6 @@ from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.splice import Ends, taken_over
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.rights import without_essential
 from dora_systemd.decisions.cell.status import RESTART, STOP, CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell
@@ -107,8 +106,7 @@ class Member(Shared):
         take_over: Callable[[MemberBoot], Awaitable[Ends]] = _connection_of,
     ) -> None:
         # The head decides which failure ends the dataflow: its members only report them.
-        rights = without_essential(options.node_rights)
-        super().__init__(options._replace(owes=(), node_rights=rights), this_life)
+        super().__init__(options.without("owes", "essential"), this_life)
         if not isinstance(boot, MemberBoot):
             raise no_head()
         self._boot, self._take_over = boot, take_over

@@ -9,7 +9,12 @@ from dora_systemd.adapters.dora.preparation import check_named_nodes
 from dora_systemd.adapters.host.rights import check_cpus, prove_rights, read_base
 from dora_systemd.decisions.cell.limits import CPUS, has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.rights import NodeRights, format_commands, rights_commands
+from dora_systemd.decisions.cell.rights import (
+    NodeRights,
+    format_commands,
+    rights_commands,
+    rights_of,
+)
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.values import format_cpus
 
@@ -24,9 +29,9 @@ def launcher_rights(options: RunnerOptions, unit: Path) -> str:
     has_cpuset = cgroup.CPUSET in cgroup.read_controllers(unit)
     loose = () if has_cpuset else filter(has_cpus, options.node_limits)
     bound = {one.node: format_cpus(dict(one.limits)[CPUS]) for one in loose}
-    if not options.node_rights and not bound:
+    if not rights_of(options) and not bound:
         return ""
-    return format_commands(rights_commands(options.node_rights, read_base(bound)))
+    return format_commands(rights_commands(rights_of(options), read_base(bound)))
 
 
 def check_first(
@@ -44,4 +49,4 @@ def check_first(
     # A dry run of a user is in no unit, and has the rights of that shell.
     if _OF_UNITS.search(group or cgroup.group_of()):
         check_cpus(options.node_limits)
-        prove(options.node_rights)
+        prove(rights_of(options))

@@ -6,7 +6,7 @@ from typing import Any
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.preparation import PACKAGE
 from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
-from dora_systemd.decisions.cell.owes import PROBE
+from dora_systemd.decisions.cell.owes import PROBE, owes_of
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life.states import State
@@ -91,7 +91,7 @@ class Probe:
 
         Empty if all nodes that owe something have ended.
         """
-        nodes, owes = self._run.pump.cell.nodes, self._plan.options.owes
+        nodes, owes = self._run.pump.cell.nodes, owes_of(self._plan.options)
         if not any(_can_come(nodes.get(one.node)) for one in owes):
             return []
         slots = enumerate(self._feeds.places)

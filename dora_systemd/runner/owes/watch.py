@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.dora.probe import probe_python
-from dora_systemd.decisions.cell.owes import RESTART, WARN
+from dora_systemd.decisions.cell.owes import RESTART, WARN, owes_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
@@ -57,8 +57,8 @@ class Watch:
         self._run = run
         self._engine = dora
         self._dialogue = dialogue
-        feeds = find_feeds(plan.options.owes, prepared.dataflow, self._is_here)
-        self._judge = Judge(plan.options.owes, feeds=feeds)
+        feeds = find_feeds(owes_of(plan.options), prepared.dataflow, self._is_here)
+        self._judge = Judge(owes_of(plan.options), feeds=feeds)
         size = size_of_times(len(feeds.places))
         self._times = SharedTimes(run.nodes.places[1].times, size)
         self._probe = Probe(run, dora, plan, feeds, self._judge.tick, find_python)

@@ -11,6 +11,7 @@ from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.launch import has_pipes, kinds
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owes import owes_of
 from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.life.view import has_started
@@ -46,7 +47,7 @@ def is_read(node: str, options: RunnerOptions, *versions: Prepared) -> bool:
 
     versions: of the dataflow; one of them is enough.
     """
-    is_owing = any(one.node == node for one in options.owes)
+    is_owing = any(one.node == node for one in owes_of(options))
     return is_owing or any(has_readers(node, one.descriptor["nodes"]) for one in versions)
 
 

@@ -162,7 +162,12 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
 def _rights(cell: Cell) -> "dict[str, NodeRights] | None":
     """The rights of nodes; None for a row of the table, which does not read the options."""
     options = cell.known_options
-    return options and {one.node: one for one in options.node_rights}
+    if options is None or not options.settings:
+        return options and {}
+    # Imported late: few dataflows have any.
+    from dora_systemd.decisions.cell.rights import rights_of
+
+    return {one.node: one for one in rights_of(options)}
 
 
 def _right_facts(rights: "dict[str, NodeRights] | None", node: str) -> dict[str, Any]:
@@ -187,7 +192,12 @@ def _cpus(reading: Reading, node: str) -> str:
 
 def _outputs(reading: Reading, node: str) -> tuple[OutputRow, ...]:
     """The outputs that the node owes; none in the table."""
-    owes = reading.cell.options.owes if reading.heard else ()
+    if not reading.heard:
+        return ()
+    # Imported late: few dataflows owe anything.
+    from dora_systemd.decisions.cell.owes import owes_of
+
+    owes = owes_of(reading.cell.options)
     return tuple(
         OutputRow(owed.output, owed.within, owed.then, max(reading.at_us - at, 0) if at else None)
         for owed, at in zip(owes, reading.heard, strict=False)

@@ -109,9 +109,18 @@ def read_dataflow(
     nodes = {} if is_row and status.nodes else cgroup.shown_groups(path, status.nodes)
     groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
-    heard = () if is_row else read_heard(scope, cell.name, cell.options.owes)
+    heard = () if is_row else _heard(scope, cell)
     read = Reading(cell, unit, status, problem, groups, usage, _monotonic_us(), heard)
     return read._replace(is_frozen=cgroup.is_frozen(path))
+
+
+def _heard(scope: Scope, cell: Cell) -> tuple[int, ...]:
+    if not cell.options.has("owes"):
+        return ()
+    # Imported late: few dataflows owe anything.
+    from dora_systemd.decisions.cell.owes import owes_of
+
+    return read_heard(scope, cell.name, owes_of(cell.options))
 
 
 def _read_held(manager: Manager, cell: Cell) -> Reading:

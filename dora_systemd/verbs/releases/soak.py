@@ -13,7 +13,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager, queued_job
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owes import Owed
+from dora_systemd.decisions.cell.owes import Owed, owes_of
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.progress import Step, soaking, starting, stopping
 from dora_systemd.decisions.why.faults import FAULT_IDS, WAITING, Fault, find_fault, is_finished
@@ -174,7 +174,7 @@ class Gate:
 
     def _unheard(self) -> Owed | None:
         """The owed output that the trial has to wait for the longest, if any has not come yet."""
-        owes = self._options.owes
+        owes = owes_of(self._options)
         if self._may_wait and any(one.name == WAITING for one in self._happenings()):
             return None
         pairs = zip(owes, self._hear(self._scope, self._options.name, owes), strict=True)

@@ -11,7 +11,7 @@ from dora_systemd.adapters.host.files import absolute_path
 from dora_systemd.decisions.cell.launch import LaunchPlan, python_of
 from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.rights import has_process_rights
+from dora_systemd.decisions.cell.rights import has_process_rights, rights_of
 from dora_systemd.decisions.cell.uv import uv_project
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.needs.units import device_entries, needs_can
@@ -49,7 +49,7 @@ def make_sandbox(
     offers_identity: whether the machine can create a user namespace; None: find out.
     """
     sight, settings, user, options = look.sight, look.settings, look.user, launch.options
-    rights = options.node_rights
+    rights = rights_of(options)
     given = [_checked(path, sight, user) for path in settings[WRITABLE]]
     denied = [] if user is None else [path for path in given if not sight.is_writable(path)]
     needed = tuple(dict.fromkeys(_existing(_needed(dataflow, launch, sight), sight)))

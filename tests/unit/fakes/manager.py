@@ -1,13 +1,20 @@
 """A systemd of a few dicts: what the use cases of doractl are tested against."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Self
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Beside, Observer, Property, UnitState
-from dora_systemd.decisions.cell.options import RunnerOptions, runner_command
+from dora_systemd.decisions.cell.options import (
+    RunnerOptions,
+    SettingText,
+    parse_setting,
+    runner_command,
+)
+from dora_systemd.decisions.cell.owes import Owed, format_owed
+from dora_systemd.decisions.cell.rights import BY_KEY, NodeRights, given_rights
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_description, unit_name
 from dora_systemd.scope import Scope
@@ -39,6 +46,27 @@ def options(name: str = "robot", uuid: str = UUID, **more: Any) -> RunnerOptions
     """What a runner of that name was told."""
     values = {"dataflow": f"/srv/{name}.yml", "working_directory": "/srv", "dora": "/bin/dora"}
     return RunnerOptions(name=name, uuid=uuid, **{**values, **more})
+
+
+def with_texts(options: RunnerOptions, *texts: str) -> RunnerOptions:
+    """The options with [NODE:]KEY=TEXT."""
+    return options._replace(settings=(*options.settings, *map(parse_setting, texts)))
+
+
+def with_rights(options: RunnerOptions, *rights: NodeRights) -> RunnerOptions:
+    given = ((one.node, key, value) for one in rights for key, value in given_rights(one).items())
+    return _with(options, (SettingText(n, key, BY_KEY[key].format(v)) for n, key, v in given))
+
+
+def with_owes(options: RunnerOptions, *owes: Owed) -> RunnerOptions:
+    return _with(
+        options,
+        (SettingText(one.node, "owes", format_owed(one._replace(node=""))) for one in owes),
+    )
+
+
+def _with(options: RunnerOptions, texts: Iterable[SettingText]) -> RunnerOptions:
+    return options._replace(settings=(*options.settings, *texts))
 
 
 class FakeManager:

@@ -97,7 +97,7 @@ LATE = {
         },
         "verbs.facts.reading": {
             *("decisions.machines.usage", "decisions.owes.probe"),
-            *("verbs.facts.held", "verbs.facts.budget"),
+            *("verbs.facts.held", "verbs.facts.budget", "decisions.cell.owes"),
         },
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
@@ -129,10 +129,12 @@ LATE = {
             *("decisions.cell.machines", "decisions.cell.status"),
         },
     },
-    "most dataflows have no notify sockets": {
+    "most dataflows have no notify sockets, and no node has rights or owes anything": {
         "runner.nodes.nodes": {"runner.nodes.watchdog"},
         "runner.cell.dialogue": {"runner.nodes.watchdog"},
-        "verbs.facts.list": {"decisions.watchdog.messages"},
+        "verbs.facts.list": {
+            *("decisions.watchdog.messages", "decisions.cell.owes", "decisions.cell.rights"),
+        },
     },
     "asyncio and WebSockets: of all verbs, a few need one of them": {
         "verbs.node": {"adapters.dora.control", "adapters.runner_socket.relay"},

@@ -23,13 +23,10 @@ from dora_systemd.decisions.cell.options import (
     runner_command,
 )
 from dora_systemd.decisions.cell.owes import SHORTEST as SHORTEST_TIME
-from dora_systemd.decisions.cell.owes import THEN, Owed
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
-from dora_systemd.decisions.cell.rights import parse_node_rights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import limits_of_a_node
-from tests.unit.fakes.rights_values import rights_of_a_node
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora")
@@ -50,7 +47,6 @@ policies = st.builds(
 )
 outputs = st.from_regex(r"[a-z][a-z0-9_/:.-]{0,20}", fullmatch=True)
 spans = st.integers(SHORTEST_TIME, 10**12)
-owed = st.builds(Owed, idents, outputs, spans, spans, st.sampled_from(THEN))
 given_settings = st.builds(SettingText, st.just("") | idents, st.sampled_from([*MODULES]), texts)
 options = st.builds(
     RunnerOptions,
@@ -67,13 +63,16 @@ options = st.builds(
     allow_shell_nodes=st.booleans(),
     grace=st.integers(0, 2**64 - 1),
     settings=st.lists(given_settings).map(tuple),
+    placed=st.just(()),
+    machine=st.just(""),
+    head=st.just(""),
+    addresses=st.just(()),
     attached=st.booleans(),
     exit_when_nodes_finish=st.none() | st.booleans(),
     env_keys=st.lists(texts).map(tuple),
     log_rates=st.dictionaries(nodes, st.none() | rates),
     node_limits=st.lists(limits_of_a_node()).map(tuple),
     restart=policies,
-    node_rights=st.lists(rights_of_a_node()).map(tuple),
     node_restarts=st.lists(st.tuples(st.text(min_size=1), policies)).map(tuple),
     start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
     watchdogs=st.dictionaries(nodes, st.integers(0, INFINITY)),
@@ -85,7 +84,6 @@ options = st.builds(
         st.lists(st.tuples(idents, texts)).map(tuple),
         st.lists(st.tuples(st.just("") | idents, st.sampled_from(REPLACE_WORDS))).map(tuple),
     ),
-    owes=st.lists(owed).map(tuple),
     needs=st.lists(
         st.builds(NodeNeed, idents, st.sampled_from(["/dev/video0", "/dev/by-id/a=b c", "/é"]))
     ).map(tuple),
@@ -111,22 +109,26 @@ ALL = RunnerOptions(
     log_rates={ALL_NODES: RateLimit(1000, SECOND), "camera": None},
     node_limits=(parse_node_limits("camera:cpu=1.5,memory=1G"),),
     restart=RestartPolicy("on-failure"),
-    node_rights=(parse_node_rights("camera:nice=5,essential"),),
     node_restarts=(("a:b", RestartPolicy("always", INFINITY, INFINITY, SECOND, SECOND)),),
     start_timeout=90 * SECOND,
     reload=HotReload(
         True, ("*.py", "a=b"), ("tmp_*",), (("camera", "x=y"),), (("", "start-first"), ("a", "b"))
     ),
-    owes=(Owed("camera", "image", 2 * SECOND, 90 * SECOND, "warn"),),
+    settings=(
+        SettingText("camera", "nice", "5"),
+        SettingText("camera", "owes", "/image:within=2s,first=1min 30s,then=warn"),
+        SettingText("", "stop_limit", "1h"),
+    ),
 )
 ARGUMENTS = f"""\
 --name=robot --uuid={UUID} --working-directory=/srv --dora=/usr/bin/dora --grace-duration=5s
 --venv=/srv/venv --exit-when-nodes-finish=no
 --restart=on-failure,max=5,window=10min,delay=500ms,max-delay=30s '--start-timeout=1min 30s'
 --env-key=MODEL --env-key=RATE --log-rate-limit=1000/1s --log-rate-limit=camera=infinity
---node-limit=camera:cpu=150%,memory=1G --node-rights=camera:nice=5,essential=yes
+--node-limit=camera:cpu=150%,memory=1G
 --node-restart=a:b:always,max=infinity,window=infinity,delay=1s,max-delay=1s
-'--owes=camera/image:within=2s,first=1min 30s,then=warn'
+--set=camera:nice=5 '--set=camera:owes=/image:within=2s,first=1min 30s,then=warn'
+--set=stop_limit=1h
 --watch=*.py --watch=a=b --ignore=tmp_* --node-watch=camera=x=y --replace==start-first --replace=a=b
 --uv --debug --allow-shell-nodes --attached --hot-reload /srv/robot.yml
 """

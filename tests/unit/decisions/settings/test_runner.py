@@ -1,7 +1,6 @@
 """A setting travels as text: to the runner, to a member, and through `doractl set`."""
 
 import json
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,6 +16,8 @@ from dora_systemd.decisions.cell.options import (
     parse_setting,
     runner_setting,
 )
+from dora_systemd.decisions.cell.owes import owes_of
+from dora_systemd.decisions.cell.rights import NodeRights, rights_of
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.descriptor.nodes import parse_node
 from dora_systemd.decisions.machines.entry import Machine
@@ -52,9 +53,9 @@ def test_each_module_has_the_settings_of_the_table(key: str) -> None:
 def test_a_value_of_a_file_reaches_the_runner() -> None:
     options = started()
     assert [one for one in format_runner_argv(options) if one.startswith("--set=")] == [
+        "--set=stop_limit=3min 20s",
         "--set=camera:stop=within=1min",
         "--set=arm:stop=after=camera",
-        "--set=stop_limit=3min 20s",
     ]
     assert options.has("stop")
     assert options.of_dataflow("stop_limit") == 200 * SECOND
@@ -129,13 +130,34 @@ def test_each_machine_gets_the_settings_of_its_nodes() -> None:
     assert there.by_node("stop") == {"yolo": NodeStop("", 7 * SECOND)}
 
 
-def test_what_only_the_head_obeys_stays_there() -> None:
-    setting = runner_setting("stop")
-    module = __import__("dora_systemd.decisions.settings.stops", fromlist=["RUNNER_SETTINGS"])
-    module.RUNNER_SETTINGS["stop"] = replace(setting, only_head=True)
-    try:
-        head, words, _ = spread("stop", "within=7s")
-    finally:
-        module.RUNNER_SETTINGS["stop"] = setting
+def test_the_head_decides_with_what_its_members_know_too() -> None:
+    """Which failure ends the dataflow, and whose memory goes last."""
+    head, words, there = spread("essential", "yes")
+    assert head.by_node("essential") == {"camera": True, "yolo": True}
+    assert words == ["essential=yes", "yolo:essential=yes"]
+    assert there.by_node("essential") == {"yolo": True}
+
+
+def test_members_watch_no_outputs() -> None:
+    head, words, _ = spread("owes", "/image:within=2s")
     assert words == []
-    assert head.by_node("stop").keys() == {"camera", "yolo"}
+    assert head.by_node("owes").keys() == {"camera"}
+
+
+def test_values_of_a_flag_that_names_nodes_are_those_of_the_nodes() -> None:
+    given = {
+        "node_rights": ("camera:nice=5,essential", "arm:scheduling=idle"),
+        "owes": "camera/image:within=2s",
+    }
+    beside = {"nice": 3, "nodes": {"camera": {"nice": 9, "owes": {"output": "d", "within": "9s"}}}}
+    settings = resolve_settings(given, {}, [("/srv/robot.systemd.yml", beside)])
+    options = with_settings(OPTIONS, settings)
+    assert [one.partition("=")[2] for one in format_runner_argv(options) if "--set" in one] == [
+        "camera:nice=5",
+        "camera:owes=/d:within=9s,first=30s,then=restart",
+        "camera:owes=/image:within=2s,first=30s,then=restart",
+        "camera:essential=yes",
+        "arm:scheduling=idle",
+    ], "the nice value for all is a property of the unit"
+    assert [one.place for one in owes_of(options)] == ["camera/d", "camera/image"]
+    assert rights_of(options)[0] == NodeRights("camera", nice=5, essential=True)

@@ -15,6 +15,7 @@ from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from tests.unit.fakes.dialogue import OPTIONS, Bench
 from tests.unit.fakes.loop import live
+from tests.unit.fakes.manager import with_owes, with_rights
 from tests.unit.fakes.run import Calls
 
 
@@ -115,7 +116,7 @@ PROBE_NODE = f"{PROBE}a"
 
 def test_a_node_that_the_runner_has_added_is_none_of_the_dataflow(tmp_path: Path) -> None:
     async def work() -> None:
-        bench = Bench(tmp_path, options=OPTIONS._replace(owes=OWES))
+        bench = Bench(tmp_path, options=with_owes(OPTIONS, *OWES))
         assert await hear(bench, EXITED.format("false"), PROBE_NODE) == []
         done = await hear(bench, EXITED.format("false"))
         assert done == [("push", "NodeExited"), ("forget", "a")]
@@ -131,7 +132,7 @@ def test_the_result_has_only_nodes_of_the_dataflow(tmp_path: Path) -> None:
     ended = {"DataflowStopped": {"result": {"node_results": results}}}
 
     async def work() -> None:
-        bench = Bench(tmp_path, State.CLOSING, options=OPTIONS._replace(owes=OWES))
+        bench = Bench(tmp_path, State.CLOSING, options=with_owes(OPTIONS, *OWES))
         bench.dora.answers["Check"].append(ended)
         assert await bench.do(Do.ASK_RESULT) == [life.ResultKnown(0, {"a": Exit()})]
 
@@ -142,7 +143,7 @@ def test_a_node_gets_its_rights_when_it_is_executed(tmp_path: Path) -> None:
     rights = (NodeRights("a", nice=5),)
 
     async def work() -> None:
-        bench = Bench(tmp_path, options=OPTIONS._replace(node_rights=rights))
+        bench = Bench(tmp_path, options=with_rights(OPTIONS, *rights))
         done = await hear(bench, "spawned node with pid 8")
         assert done == [("adopt", "a", 8, *rights), ("push", "NodeSpawned")]
 
@@ -154,7 +155,7 @@ def test_the_end_of_an_essential_node_says_so(tmp_path: Path, node: str) -> None
     rights = (NodeRights("a", essential=True),)
 
     async def work() -> None:
-        bench = Bench(tmp_path, options=OPTIONS._replace(node_rights=rights))
+        bench = Bench(tmp_path, options=with_rights(OPTIONS, *rights))
         await hear(bench, EXITED.format("false"), node)
         (event,) = bench.heard
         assert isinstance(event, life.NodeExited)

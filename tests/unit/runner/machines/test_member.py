@@ -16,7 +16,7 @@ from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.rights import NodeRights
+from dora_systemd.decisions.cell.rights import NodeRights, rights_of
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
@@ -32,6 +32,7 @@ from tests.unit.fakes.boots import told_boot
 from tests.unit.fakes.dialogue import Heard
 from tests.unit.fakes.ends import FakeEnds
 from tests.unit.fakes.loop import live
+from tests.unit.fakes.manager import with_rights
 from tests.unit.fakes.run import FakeNodes, FakePipes
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
@@ -371,7 +372,6 @@ def test_the_head_hears_why_a_node_is_ended(tmp_path: Path) -> None:
 
 def test_only_the_head_decides_what_is_essential(tmp_path: Path) -> None:
     """Else the end of the part would come first, and look like the loss of its machine."""
-    rights = (NodeRights("mid", essential=True), NodeRights("mid", essential=True, nice=5))
-    options = OPTIONS._replace(node_rights=rights)
+    options = with_rights(OPTIONS, NodeRights("mid", essential=True, nice=5))
     member = Member(options, Life("uuid"), told_boot(options, tmp_path, PART))
-    assert member.options.node_rights == (NodeRights("mid", nice=5),)
+    assert rights_of(member.options) == (NodeRights("mid", nice=5),)

@@ -1,7 +1,6 @@
 """The rights of nodes in the cell: what the launcher gets, and when they are proved."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,13 +12,13 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import daemon_variables
 from dora_systemd.runner.nodes.rights import check_first, launcher_rights
-from tests.unit.fakes.manager import options
+from tests.unit.fakes.manager import options, with_rights
 
 FLOW = parse_dataflow({"nodes": [{"id": "camera", "path": "camera.py"}]}, "robot.yml")
 
 
-def with_cpus(**more: Any) -> RunnerOptions:
-    return options(node_limits=(parse_node_limits("camera:cpus=0,memory=1G"),), **more)
+def with_cpus() -> RunnerOptions:
+    return options(node_limits=(parse_node_limits("camera:cpus=0,memory=1G"),))
 
 
 def variables(unit: Path, given: RunnerOptions) -> dict[str, str]:
@@ -39,7 +38,7 @@ def test_the_launcher_binds_nodes_only_where_no_cgroup_does(tmp_path: Path) -> N
     assert launcher_rights(with_cpus(), tmp_path) == ""
     rights = (parse_node_rights("camera:scheduling=idle"),)
     line = "camera /usr/bin/chrt --idle 0\n* \n"
-    assert launcher_rights(with_cpus(node_rights=rights), tmp_path) == line
+    assert launcher_rights(with_rights(with_cpus(), *rights), tmp_path) == line
 
 
 @pytest.mark.parametrize(
@@ -53,10 +52,10 @@ def test_the_launcher_binds_nodes_only_where_no_cgroup_does(tmp_path: Path) -> N
 def test_rights_are_proved_in_a_unit(group: str, is_proved: bool) -> None:
     proved: list[object] = []
     rights = (parse_node_rights("camera:nice=5"),)
-    check_first(options(node_rights=rights), FLOW, group, proved.append)
+    check_first(with_rights(options(), *rights), FLOW, group, proved.append)
     assert proved == [rights] * is_proved
 
 
 def test_rights_of_a_node_that_is_not_there() -> None:
     with pytest.raises(DoraSystemdError, match="the node 'radar': no such node"):
-        check_first(options(node_rights=(parse_node_rights("radar:essential"),)), FLOW)
+        check_first(with_rights(options(), parse_node_rights("radar:essential")), FLOW)

@@ -19,6 +19,7 @@ from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.swap import Swapper
 from dora_systemd.values import SECOND
 from tests.unit.fakes.loop import live
+from tests.unit.fakes.manager import with_owes
 from tests.unit.fakes.reload import ReloadBench
 from tests.unit.fakes.run import Calls, FakeNodes, FakePipes
 
@@ -50,7 +51,7 @@ class Bench(ReloadBench):
         super().__init__(root)
         self.owing = OwingNodes(root, self.pipes, self.calls)
         self.run = Run(self.pump, self.owing, self.pipes, Swapper(self.pump, self.dora))
-        options = self.options._replace(owes=owes or (OWED,))
+        options = with_owes(self.options, *(owes or (OWED,)))
         self.python = "/venv/bin/python"
         plan = replace(self.prepared.plan, options=options)
         changed = replace(self.prepared, plan=plan)

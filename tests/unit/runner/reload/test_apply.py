@@ -18,6 +18,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.reload.swap import NotReady
 from dora_systemd.values import SECOND
 from tests.unit.fakes.loop import live
+from tests.unit.fakes.manager import with_owes
 from tests.unit.fakes.reload import EXCHANGES, RUNNING
 from tests.unit.fakes.reload import ReloadBench as Bench
 
@@ -119,7 +120,7 @@ def test_a_node_that_owes_an_output_is_not_removed(tmp_path: Path) -> None:
 
     async def work() -> None:
         bench = Bench(tmp_path)
-        bench.options = bench.options._replace(owes=(Owed("a", "o", SECOND, SECOND, "warn"),))
+        bench.options = with_owes(bench.options, Owed("a", "o", SECOND, SECOND, "warn"))
         await bench.applier((How.SWAP, "a")).apply()
         assert bench.asked == [("RestartNode", "a"), ("ReplaceNode", "a")]
 

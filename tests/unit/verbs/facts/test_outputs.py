@@ -17,7 +17,7 @@ from dora_systemd.trust.files import read_times
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import dataflow_row
-from tests.unit.fakes.manager import FakeManager, options
+from tests.unit.fakes.manager import FakeManager, options, with_owes, with_rights
 from tests.unit.verbs.facts.test_list import GROUP, scope, unit_group, write_status
 
 __all__ = ["scope", "unit_group"]
@@ -27,7 +27,7 @@ OWES = (Owed("camera", "image", 2 * SECOND), Owed("camera", "depth", SECOND, the
 
 def outputs(scope: Scope, data: bytes) -> tuple[OutputRow, ...]:
     manager = FakeManager()
-    manager.add(options()._replace(owes=OWES), ControlGroup=GROUP)
+    manager.add(with_owes(options(), *OWES), ControlGroup=GROUP)
     write_status(scope, CellStatus(nodes={"camera": NodeStatus("running")}))
     (scope.cell_directory("robot") / "times").write_bytes(data)
     (camera,) = dataflow_row(manager, scope, read_cells(manager)[0]).nodes
@@ -84,7 +84,7 @@ def test_other_files_in_its_place(tmp_path: Path) -> None:
 def test_what_is_special_about_nodes(scope: Scope) -> None:
     manager = FakeManager()
     rights = (parse_node_rights("camera:essential,scheduling=batch"),)
-    manager.add(options()._replace(node_rights=rights), ControlGroup=GROUP)
+    manager.add(with_rights(options(), *rights), ControlGroup=GROUP)
     nodes = {one: NodeStatus("running") for one in ("camera", "plot")}
     write_status(scope, CellStatus(nodes=nodes))
     camera, plot = dataflow_row(manager, scope, read_cells(manager)[0]).nodes

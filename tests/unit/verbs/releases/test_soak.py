@@ -17,7 +17,7 @@ from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.lives import now_boot
 from dora_systemd.verbs.releases.soak import Gate
 from tests.unit.fakes.journal import FakeJournal, life_record
-from tests.unit.fakes.manager import FakeManager, options
+from tests.unit.fakes.manager import FakeManager, options, with_owes
 
 HUNG = "the supervisor process hung and was killed by the watchdog"
 IMAGE, DEPTH = Owed("camera", "image", SECOND, 3 * SECOND), Owed("camera", "depth", SECOND, SECOND)
@@ -40,7 +40,7 @@ def soaked(
     comes: tuple[float, ...],
 ) -> tuple[Fault | None, list[Step]]:
     """What a trial of 2 s finds and tells, whose outputs come so many seconds after its begin."""
-    runner = options(owes=(IMAGE, DEPTH)[: len(comes)])
+    runner = with_owes(options(), *(IMAGE, DEPTH)[: len(comes)])
     manager.add(runner, InvocationID=b"")
     told: list[Step] = []
     begun = clock[0]
@@ -170,9 +170,9 @@ def test_a_node_may_wait_for_what_it_needs(
 ) -> None:
     """Then nobody waits for what nodes owe; another fault is one in any case."""
     assert clock
-    manager.add(options(owes=(IMAGE,)), InvocationID=b"")
+    manager.add(with_owes(options(), IMAGE), InvocationID=b"")
     gate = Gate(
-        *(manager, scope, options(owes=(IMAGE,)), lambda _: None, lambda *_: (0,)),
+        *(manager, scope, with_owes(options(), IMAGE), lambda _: None, lambda *_: (0,)),
         may_wait=may_wait,
     )
     waits = record("node-waiting", DORA_NODE="camera", DORA_REASON="/dev/cam (not there)")
