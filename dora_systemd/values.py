@@ -240,3 +240,8 @@ def as_mapping(value: object) -> dict[str, Any]:
 def as_list(value: object) -> list[Any]:
     """The value if it is a list of JSON or YAML, else an empty one."""
     return value if isinstance(value, list) else []
+
+
+def format_number(value: int) -> str:
+    """A number, or "infinity"."""
+    return "infinity" if value == INFINITY else str(value)

@@ -25,6 +25,8 @@ from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import serve
 from dora_systemd.decisions.cell.environment import with_changes
 from dora_systemd.decisions.cell.launch import kinds
+from dora_systemd.decisions.cell.limits import limits_of
+from dora_systemd.decisions.cell.line_rates import rates_of
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.decisions.cell.stops import named_stops
 from dora_systemd.decisions.descriptor.dataflow import downstream_of
@@ -230,7 +232,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         coordinator = role.start_coordinator(dora)
         prepared = reloader.current or prepare_first(runs, options)
         role.prepare(runs.paths, prepared, runs.check)
-        runs.nodes.prepare(role.here(prepared.dataflow), own.log_rates, own.node_limits)
+        runs.nodes.prepare(role.here(prepared.dataflow), rates_of(own), limits_of(own))
         table = initial_nodes(
             kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
         )

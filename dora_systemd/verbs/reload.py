@@ -17,7 +17,7 @@ from dora_systemd.adapters.host.unit_files import (
 from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.environment import with_changes
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
-from dora_systemd.decisions.cell.line_rates import RateLimits, format_rates
+from dora_systemd.decisions.cell.line_rates import RateLimits, format_rates, rates_of
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -97,7 +97,7 @@ def limit_lines(
 
     environment: that of the unit before the change. undo: gets what restores the limits.
     """
-    path, before = socket_of(scope, cell), with_changes(cell.options, environment).log_rates
+    path, before = socket_of(scope, cell), rates_of(with_changes(cell.options, environment))
     ask(path, _rates_request({**before, **given}))
     undo.callback(ask, path, _rates_request(before))
 

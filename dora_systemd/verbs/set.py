@@ -14,24 +14,19 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.limits import limit_groups
-from dora_systemd.adapters.host.unit_files import LOG_RATES_FILE, NODE_LIMITS_FILE
+from dora_systemd.adapters.host.unit_files import SET_FILE
 from dora_systemd.adapters.runner_socket.client import order
 from dora_systemd.decisions.cell import line_rates
-from dora_systemd.decisions.cell.limits import (
-    BY_KEY,
-    CHANGES_VARIABLE,
-    NodeLimits,
-    check_nodes,
-    format_changes,
-    merge_node_limits,
-    parse_changes,
-)
+from dora_systemd.decisions.cell.environment import changes_entry, changes_of
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, check_nodes
 from dora_systemd.decisions.cell.machines import members_of
+from dora_systemd.decisions.cell.options import changed
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.settings.limit_checks import check_cpus, check_use, size_warnings
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
-from dora_systemd.decisions.settings.resolve import resolve_settings
-from dora_systemd.decisions.settings.table import CHANGEABLE, LOG_RATE_LIMIT
+from dora_systemd.decisions.settings.log_rates import LOG_RATE_LIMIT
+from dora_systemd.decisions.settings.resolve import resolve_settings, runner_texts
+from dora_systemd.decisions.settings.table import CHANGEABLE
 from dora_systemd.decisions.unit.properties import settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -85,11 +80,9 @@ def set_limits(
     # The kernel is the most likely to refuse, then systemd. `undo` reverts the steps before that.
     with ExitStack() as undo:
         _limit_groups(unit, nodes, undo)
-        if nodes:
-            changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
-            remember(unit, NODE_LIMITS_FILE, f"{CHANGES_VARIABLE}={format_changes(changes)}", undo)
-        if rates:
-            remember(unit, LOG_RATES_FILE, _changed_rates(before, rates), undo)
+        if nodes or rates:
+            changes = changed(changes_of(before), runner_texts(settings))
+            remember(unit, SET_FILE, changes_entry(changes), undo)
         if rates and unit["ControlGroup"]:
             limit_lines(scope, cell, before, rates, undo, ask)
         if properties:
@@ -98,12 +91,6 @@ def set_limits(
             manager.reload()
         undo.pop_all()
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
-
-
-def _changed_rates(environment: Mapping[str, str], given: line_rates.RateLimits) -> str:
-    """The variable for the next runners."""
-    known = line_rates.parse_changes(environment.get(line_rates.CHANGES_VARIABLE, ""))
-    return f"{line_rates.CHANGES_VARIABLE}={line_rates.format_changes({**known, **given})}"
 
 
 def _refuse_placed(cell: Cell, nodes: Iterable[str]) -> None:

@@ -14,9 +14,10 @@ from typing import Any
 from dora_systemd.adapters.dora.command import parse_dora_version, version_numbers
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.adapters.runner_socket.client import parse_line
+from dora_systemd.decisions.cell.environment import SET_VARIABLE, changes_of
 from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.exits import parse_exit
-from dora_systemd.decisions.cell.limits import parse_changes
+from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.line_rates import parse_rates
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow, parse_session
@@ -193,6 +194,10 @@ def _of_text(*readers: Callable[[str], object]) -> Callable[[bytes], None]:
     return read
 
 
+def _changes(text: str) -> object:
+    return changes_of({SET_VARIABLE: text})
+
+
 def _link(data: bytes) -> None:
     link = parse_link(data, 1)
     assert link is None or link_problem(link) in ("", "down", "bus-off", "no carrier")
@@ -239,7 +244,9 @@ TARGETS = {
     "property": Target(lambda data: parse_property(text_of(data)), REFUSED),
     "values": Target(_of_text(parse_size, parse_duration, parse_cpu, parse_bool)),
     "names": Target(_of_text(parse_name, parse_uuid, name_from_path)),
-    "limits": Target(_of_text(parse_changes, lambda text: parse_rates(text.split(";")))),
+    "limits": Target(
+        _of_text(parse_node_limits, lambda text: parse_rates(text.split(";")), _changes)
+    ),
     "exit": Target(_of_text(parse_exit, parse_dora_error, parse_filter)),
     "parcel": Target(_parcel, REFUSED),
     "link": Target(_link),

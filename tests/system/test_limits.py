@@ -105,11 +105,11 @@ def test_changes_are_remembered_while_the_dataflow_is_there(cell: Cell, project:
     cell.start(project.three_nodes())
     cell.doractl("set", cell.unit, "--node-limit=sink:cpu=infinity", "--tasks-limit=infinity")
     (run, unit) = cell.status.run, cell.doractl("show", cell.name).stdout
-    assert "DORA_SYSTEMD_NODE_LIMITS=sink:cpu=infinity" in unit
+    assert "DORA_SYSTEMD_SET=sink:cpu_limit=infinity" in unit
     cell.doractl("restart", cell.name)
     assert cell.status.run != run
     assert cell.doractl("show", cell.name).stdout == unit
     (pid,) = cell.pids("node-sink")
-    assert b"DORA_SYSTEMD_NODE_LIMITS" not in Path(f"/proc/{pid}/environ").read_bytes()
+    assert b"DORA_SYSTEMD_SET" not in Path(f"/proc/{pid}/environ").read_bytes()
     cell.doractl("stop", cell.name)
     assert not list(Path("/run/systemd").glob(f"*/{cell.unit}*"))

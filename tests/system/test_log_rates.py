@@ -32,7 +32,7 @@ def test_at_once_and_after_a_restart(cell: Cell, project: Project) -> None:
     assert set(suppressed(cell)) == {("sink", "1/1s")}
     cell.doractl("set", cell.name, "--log-rate-limit", "sink=infinity")
     wait_for("all lines are there", lambda: has_all(cell))
-    variables = "DORA_SYSTEMD_LOG_RATES=sink=infinity"
+    variables = "DORA_SYSTEMD_SET=sink:log_rate_limit=infinity"
     assert variables in cell.doractl("show", cell.name).stdout
 
 

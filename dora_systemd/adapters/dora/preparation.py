@@ -14,8 +14,6 @@ from dora_systemd.decisions.cell.launch import (
     is_launched,
     launch_descriptor,
 )
-from dora_systemd.decisions.cell.limits import check_nodes
-from dora_systemd.decisions.cell.line_rates import check_rates
 from dora_systemd.decisions.cell.needs import check_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
@@ -26,7 +24,7 @@ from dora_systemd.decisions.descriptor.dataflow import (
     parse_session,
     session_path,
 )
-from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
+from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.watchdog.watchdogs import check_watchdogs
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
@@ -79,7 +77,6 @@ def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
     """
     _check_limited(options, dataflow)
     ids = [node.id for node in dataflow.nodes]
-    check_rates(options.log_rates, ids)
     check_reload_nodes(options.reload, ids)
     launched = [node.id for node in dataflow.nodes if is_launched(node)]
     check_watchdogs(options.watchdogs, ids, launched)
@@ -88,8 +85,6 @@ def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
 
 def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     ids = [node.id for node in dataflow.nodes]
-    dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
-    check_nodes(options.node_limits, ids, dynamic)
     check_restart_nodes(options.node_restarts, ids)
     if options.settings:
         from dora_systemd.decisions.settings.runner import check_settings

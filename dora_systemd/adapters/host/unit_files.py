@@ -113,10 +113,9 @@ def put_unit_file(path: Path, text: str | None) -> None:
         write_unit_file(path, text)
 
 
-NODE_LIMITS_FILE = "60-node-limits.conf"
+SET_FILE = "60-set.conf"
 HOT_RELOAD_FILE = "60-hot-reload.conf"
-LOG_RATES_FILE = "60-log-rates.conf"
-_CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE, LOG_RATES_FILE)
+_CHANGES = ("50-*.conf", SET_FILE, HOT_RELOAD_FILE)
 """systemd's own drop-ins for changed properties, and ours for what only the runner knows."""
 
 

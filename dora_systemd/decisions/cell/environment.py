@@ -1,14 +1,18 @@
 """Environment variables of a dataflow: parses `KEY=VALUE` from flags and files, and checks them."""
 
-import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+import shlex
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PurePath
 
-from dora_systemd.decisions.cell import line_rates
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
-from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
-from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, parse_setting
+from dora_systemd.decisions.cell.options import (
+    RunnerOptions,
+    SettingText,
+    changed,
+    format_setting,
+    parse_setting,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_readable
 from dora_systemd.paths import CellPaths, own_directory
@@ -23,14 +27,13 @@ _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 LOCK_VARIABLE = "DORA_INHIBIT_LOCK"
 """Variable of the nodes with the path of the file that they lock to inhibit restarts."""
 SET_VARIABLE = "DORA_SYSTEMD_SET"
-"""Passes settings that `doractl set` has changed to the next runner: a JSON list of texts."""
+"""Passes settings that `doractl set` has changed to the next runner, as words."""
 MANAGER_VARIABLES = frozenset(
     {
         *("NOTIFY_SOCKET", "JOURNAL_STREAM", "INVOCATION_ID", "SYSTEMD_EXEC_PID", "MAINPID"),
         *("MANAGERPID", "MANAGERPIDFDID", "WATCHDOG_PID", "WATCHDOG_USEC", "RUNTIME_DIRECTORY"),
         *("LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "LISTEN_PIDFDID", "FDSTORE"),
-        *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGES_VARIABLE, CHANGE_VARIABLE),
-        line_rates.CHANGES_VARIABLE,
+        *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGE_VARIABLE),
         SET_VARIABLE,
         LOCK_VARIABLE,
     }
@@ -64,29 +67,25 @@ def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> Runn
 
     Raises DoraSystemdError for variables that `doractl set` cannot have written.
     """
-    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
-    limits = merge_node_limits(options.node_limits, changes)
     is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
-    rates = line_rates.parse_changes(environment.get(line_rates.CHANGES_VARIABLE, ""))
     return options._replace(
-        node_limits=limits,
-        log_rates={**options.log_rates, **rates},
         reload=options.reload._replace(is_on=is_on),
         settings=changed(options.settings, changes_of(environment)),
     )
 
 
 def changes_of(environment: Mapping[str, str]) -> tuple[SettingText, ...]:
-    """The settings that `doractl set` has changed. Raises DoraSystemdError, ValueError."""
-    return tuple(map(parse_setting, json.loads(environment.get(SET_VARIABLE) or "[]")))
+    """The settings that `doractl set` has changed. Raises DoraSystemdError."""
+    try:
+        texts = shlex.split(environment.get(SET_VARIABLE, ""))
+    except ValueError as error:
+        raise DoraSystemdError(f"cannot read {SET_VARIABLE}: {error}") from error
+    return tuple(map(parse_setting, texts))
 
 
-def changed(
-    settings: Sequence[SettingText], changes: Sequence[SettingText]
-) -> tuple[SettingText, ...]:
-    """The settings, with all texts of those that `changes` has replaced."""
-    gone = {one[:2] for one in changes}
-    return (*(one for one in settings if one[:2] not in gone), *changes)
+def changes_entry(changes: Iterable[SettingText]) -> str:
+    """The variable for changes_of(), as KEY=VALUE."""
+    return f"{SET_VARIABLE}={shlex.join(map(format_setting, changes))}"
 
 
 def parse_assignment(text: str) -> tuple[str, str]:

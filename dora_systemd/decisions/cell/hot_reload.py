@@ -6,7 +6,6 @@ They are part of the runner's command line, which `list` parses: imports only wh
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from dora_systemd.decisions.cell.limits import NodeLimits
 from dora_systemd.names import check_known
 
 START_FIRST = "start-first"
@@ -38,13 +37,6 @@ class HotReload(NamedTuple):
 
 
 DEFAULT_RELOAD = HotReload()
-
-
-class SettingsChange(NamedTuple):
-    """Changes of a settings file."""
-
-    limits: tuple[NodeLimits, ...]  # those of nodes
-    others: tuple[str, ...]  # keys that take effect at the next start
 
 
 def parse_of_node(text: str) -> tuple[str, str]:

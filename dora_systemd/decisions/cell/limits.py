@@ -1,13 +1,13 @@
 """Resource limits: what can be limited for a node, how it is written, and its control file.
 
-The control files are those of the kernel's "Control Group v2" document. The runner's command line
-contains limits of nodes, so this module imports only what loads quickly.
+The control files are those of the kernel's "Control Group v2" document.
 """
 
 import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import check_known
 from dora_systemd.values import (
@@ -16,6 +16,7 @@ from dora_systemd.values import (
     cpus_file,
     format_cpu,
     format_cpus,
+    format_number,
     format_size,
     parse_cpu,
     parse_cpus,
@@ -78,11 +79,6 @@ def _parse_number(text: str, lowest: int, highest: int, what: str, hint: str) ->
     return int(text)
 
 
-def format_number(value: int) -> str:
-    """A number of tasks or a weight, or "infinity"."""
-    return "infinity" if value == INFINITY else str(value)
-
-
 def _plain_file(value: int) -> str:
     return "max" if value == INFINITY else str(value)
 
@@ -138,6 +134,13 @@ class NodeLimits(NamedTuple):
         return {BY_WORD[word].file: BY_WORD[word].file_text(value) for word, value in self.limits}
 
 
+class SettingsChange(NamedTuple):
+    """Changes of a settings file."""
+
+    limits: tuple[NodeLimits, ...]  # those of nodes
+    others: tuple[str, ...]  # keys that take effect at the next start
+
+
 def node_limits(node: str, limits: Mapping[str, int]) -> NodeLimits:
     """The limits of `node`, by word."""
     return NodeLimits(node, tuple((word, limits[word]) for word in BY_WORD if word in limits))
@@ -178,18 +181,23 @@ def merge_node_limits(*sources: Iterable[NodeLimits]) -> tuple[NodeLimits, ...]:
     return tuple(node_limits(node, limits) for node, limits in merged.items() if limits)
 
 
-CHANGES_VARIABLE = "DORA_SYSTEMD_NODE_LIMITS"
-"""Passes changes by `doractl set` to the next runner, in Environment=."""
+def limits_of(options: RunnerOptions) -> tuple[NodeLimits, ...]:
+    """The limits of single nodes. Raises DoraSystemdError."""
+    named = dict.fromkeys(one.node for one in options.settings if one.node and one.key in BY_KEY)
+    found = {one.word: options.by_node(one.key) for one in LIMITS} if named else {}
+    return tuple(
+        node_limits(node, {word: own[node] for word, own in found.items() if node in own})
+        for node in named
+    )
 
 
-def parse_changes(text: str) -> tuple[NodeLimits, ...]:
-    """Parse CHANGES_VARIABLE. Raises DoraSystemdError (USAGE)."""
-    return tuple(map(parse_node_limits, text.split()))
-
-
-def format_changes(limits: Iterable[NodeLimits]) -> str:
-    """The inverse of parse_changes; node ids contain no blanks."""
-    return " ".join(map(format_node_limits, limits))
+def limit_texts(limits: Iterable[NodeLimits]) -> list[SettingText]:
+    """The limits as settings of the runner."""
+    return [
+        SettingText(one.node, BY_WORD[word].key, BY_WORD[word].format(value))
+        for one in limits
+        for word, value in one.limits
+    ]
 
 
 def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Iterable[str]) -> None:

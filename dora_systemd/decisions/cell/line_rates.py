@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import check_known
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
@@ -69,18 +70,20 @@ def format_rates(limits: RateLimits) -> list[str]:
     ]
 
 
-CHANGES_VARIABLE = "DORA_SYSTEMD_LOG_RATES"
-"""Passes changes by `doractl set` to the next runner, in Environment=."""
+_KEY = "log_rate_limit"
 
 
-def parse_changes(text: str) -> dict[str, RateLimit | None]:
-    """Parse CHANGES_VARIABLE. Raises DoraSystemdError (USAGE)."""
-    return parse_rates(filter(None, text.split(",")))
+def rates_of(options: RunnerOptions) -> RateLimits:
+    """The limits of the dataflow and of single nodes. Raises DoraSystemdError."""
+    if not options.has(_KEY):
+        return UNLIMITED
+    own = {node: limits[ALL_NODES] for node, limits in options.by_node(_KEY).items()}
+    return {**options.of_dataflow(_KEY), **own}
 
 
-def format_changes(limits: RateLimits) -> str:
-    """The inverse of parse_changes; node ids contain no commas."""
-    return ",".join(format_rates(limits))
+def rate_texts(limits: RateLimits) -> list[SettingText]:
+    """The limits as settings of the runner."""
+    return [SettingText(node, _KEY, format_rate(limit)) for node, limit in limits.items()]
 
 
 def rate_of(limits: RateLimits, node: str) -> RateLimit | None:

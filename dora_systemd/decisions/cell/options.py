@@ -4,15 +4,13 @@ There is no registry: `list` reads UUID and path of a dataflow from this command
 module imports only what loads quickly.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from operator import attrgetter
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
-from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
-from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
 from dora_systemd.decisions.cell.machines import Placed, parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.cell.needs import NodeNeed, parse_node_need
 from dora_systemd.decisions.cell.restarts import (
@@ -42,14 +40,23 @@ _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 
 MODULES = {
+    "cpu_limit": "limits",
+    "cpu_weight": "limits",
+    "cpus": "limits",
     "essential": "rights",
+    "io_weight": "limits",
     "lock_memory": "rights",
+    "log_rate_limit": "log_rates",
+    "memory_high": "limits",
+    "memory_limit": "limits",
     "nice": "limits",
     "oom_score_adjust": "rights",
     "owes": "owes",
     "scheduling": "rights",
     "stop": "stops",
     "stop_limit": "stops",
+    "swap_limit": "limits",
+    "tasks_limit": "limits",
 }
 """By key of each setting that a runner receives as text, its module in decisions/settings/."""
 
@@ -81,9 +88,6 @@ class RunnerOptions(NamedTuple):
     # overrides the descriptor's key of that name, unless None
     exit_when_nodes_finish: bool | None = None
     env_keys: tuple[str, ...] = ()  # names of the variables that override the descriptor's `env:`
-    # rate limits of log lines, see dora_systemd.decisions.cell.line_rates
-    log_rates: RateLimits = UNLIMITED
-    node_limits: tuple[NodeLimits, ...] = ()  # of single nodes
     restart: RestartPolicy = DEFAULT  # policy of nodes without one in the descriptor
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()  # policies of single nodes
     start_timeout: int = INFINITY  # µs for all nodes to become ready, or INFINITY
@@ -139,6 +143,15 @@ class RunnerOptions(NamedTuple):
         """The value that a node has of the setting, or that of the dataflow."""
         own = self.by_node(key)
         return own[node] if node in own else self.of_dataflow(key)
+
+
+def changed(
+    settings: Sequence[SettingText], changes: Iterable[SettingText]
+) -> tuple[SettingText, ...]:
+    """The settings, with all texts of those that `changes` has replaced."""
+    added = tuple(changes)
+    gone = {one[:2] for one in added}
+    return (*(one for one in settings if one[:2] not in gone), *added)
 
 
 def runner_setting(key: str) -> Any:
@@ -233,8 +246,6 @@ _OPTIONS = (
     _unless_default("restart", "restart", parse_policy, format_policy),
     _unless_default("start-timeout", "start_timeout", parse_duration, format_duration),
     _each("env-key", "env_keys"),
-    Option("log-rate-limit", "log_rates", parse_rates, format_rates, is_repeated=True),
-    _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
     Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("needs", "needs", parse_node_need, "=".join),

@@ -8,10 +8,16 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.limits import format_number
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import check_known
-from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
+from dora_systemd.values import (
+    INFINITY,
+    SECOND,
+    format_duration,
+    format_number,
+    parse_duration,
+    quoted,
+)
 
 POLICIES = ("no", "on-failure", "always")
 

@@ -44,7 +44,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dora_systemd.decisions.cell.environment import with_changes
-from dora_systemd.decisions.cell.limits import LIMITS, Limit, NodeLimits, format_node_limits
+from dora_systemd.decisions.cell.limits import (
+    LIMITS,
+    Limit,
+    NodeLimits,
+    format_node_limits,
+    limits_of,
+)
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.logs.records import Record, record_text
@@ -187,7 +193,7 @@ def fact_values(options: RunnerOptions, unit: Mapping[str, Any]) -> dict[str, An
     environment = dict(one.partition("=")[::2] for one in unit["Environment"] or ())
     now = with_changes(options, environment)
     limits = {one: unit[_read_as(one)] for one in LIMITS}
-    nodes = map(_finite, now.node_limits)
+    nodes = map(_finite, limits_of(now))
     return {
         **{one.key: one.format(value) for one, value in limits.items() if _is_set(value)},
         "node_limit": [format_node_limits(one) for one in nodes if one.limits],

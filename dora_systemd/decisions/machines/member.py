@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.line_rates import ALL_NODES, RateLimits
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     SettingText,
@@ -19,7 +18,6 @@ from dora_systemd.decisions.cell.options import (
 from dora_systemd.decisions.machines.entry import Machine
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.kinds import Setting
-from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.owes import NOTIFY, WATCHDOG
 from dora_systemd.decisions.settings.resolve import SET, Settings
 from dora_systemd.decisions.settings.sandbox import SANDBOX
@@ -27,11 +25,10 @@ from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
     ENV,
     GRACE_DURATION,
-    LOG_RATE_LIMIT,
     UV,
     WORKING_DIRECTORY,
 )
-from dora_systemd.decisions.watchdog.watchdogs import OFF, Watchdogs, watchdog_of
+from dora_systemd.decisions.watchdog.watchdogs import ALL_NODES, OFF, Watchdogs, watchdog_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
 
@@ -61,8 +58,6 @@ def on_head(options: RunnerOptions) -> RunnerOptions:
     away = {one.node for one in options.placed}
     return options._replace(
         head="",
-        node_limits=tuple(one for one in options.node_limits if one.node not in away),
-        log_rates={key: one for key, one in options.log_rates.items() if key not in away},
         watchdogs=_without(options.watchdogs, away),
         settings=tuple(
             one
@@ -156,16 +151,6 @@ def _directory(machine: Machine, options: RunnerOptions) -> str:
 
 def _of_nodes(options: RunnerOptions, nodes: Sequence[str]) -> Iterator[tuple[Setting[Any], Any]]:
     limits = {node: watchdog_of(options.watchdogs, node) for node in nodes}
-    yield NODE_LIMIT, _about(options.node_limits, nodes)
-    yield LOG_RATE_LIMIT, _rates(options.log_rates, nodes)
     yield WATCHDOG, {node: limit for node, limit in limits.items() if OFF < limit < INFINITY}
     if INFINITY in limits.values():
         yield NOTIFY, True
-
-
-def _about(given: Sequence[Any], nodes: Sequence[str]) -> tuple[Any, ...]:
-    return tuple(one for one in given if one.node in nodes)
-
-
-def _rates(rates: RateLimits, nodes: Sequence[str]) -> RateLimits:
-    return {node: one for node, one in rates.items() if node in (ALL_NODES, *nodes)}

@@ -3,10 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dora_systemd.decisions.cell.hot_reload import SettingsChange
-from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, node_limits
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, SettingsChange, node_limits
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
-from dora_systemd.decisions.settings.resolve import Settings, settings_node_limits
+from dora_systemd.decisions.settings.resolve import Settings, runner_texts
 from dora_systemd.decisions.settings.table import ENV, PROPERTY, SETTINGS, WORKING_DIRECTORY
 from dora_systemd.values import INFINITY
 
@@ -29,7 +28,11 @@ def settings_change(before: Settings, after: Settings) -> SettingsChange:
 
 
 def _by_node(settings: Settings) -> dict[str, dict[str, int]]:
-    return {one.node: dict(one.limits) for one in settings_node_limits(settings)}
+    found: dict[str, dict[str, int]] = {}
+    for one in runner_texts(settings):
+        if one.node and (limit := BY_KEY.get(one.key)):
+            found.setdefault(one.node, {})[limit.word] = limit.parse(one.text)
+    return found
 
 
 def _changed(node: str, old: Mapping[str, int], new: Mapping[str, int]) -> NodeLimits:

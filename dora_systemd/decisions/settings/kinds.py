@@ -11,7 +11,6 @@ from dora_systemd.decisions.cell.environment import (
     environment_entries,
     parse_assignment,
 )
-from dora_systemd.decisions.cell.line_rates import format_rates, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -230,7 +229,4 @@ PROPERTIES = Kind[tuple[str, ...]](
     is_repeatable=True,
     merge=add,
     metavar="KEY=VALUE",
-)
-LINE_RATES = many_texts(
-    "LINES/TIME such as 1000/1s", "[NODE=]LINES/TIME", parse_rates, format_rates, or_
 )

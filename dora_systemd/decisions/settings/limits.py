@@ -1,18 +1,24 @@
 """The settings that limit a dataflow or its nodes, see systemd.resource-control(5)."""
 
 import re
+from collections.abc import Mapping, Sequence
 from operator import add
 from typing import Any
 
 from dora_systemd.decisions.cell.limits import (
     BY_KEY,
+    BY_WORD,
     LIMITS,
     NodeLimits,
+    check_nodes,
     format_node_limits,
+    limits_of,
     merge_node_limits,
     parse_node_limits,
 )
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import is_negative, parse_nice
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text, texts_of_nodes
 from dora_systemd.decisions.settings.rights import check_rights
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -52,6 +58,7 @@ def _limit_setting(key: str, help_text: str) -> Setting[int | None]:
         property=limit.property,
         # A higher weight takes resources from all others on the machine.
         root_only=is_weight,
+        check=_check,
     )
 
 
@@ -75,6 +82,15 @@ def _parse_device(text: str) -> str:
     return f"{match[1]} {match[2] or _DEFAULT_ACCESS}"
 
 
+def _check(options: RunnerOptions, nodes: Sequence[Node]) -> None:
+    dynamic = [node.id for node in nodes if node.kind is NodeKind.DYNAMIC]
+    check_nodes(limits_of(options), [node.id for node in nodes], dynamic)
+
+
+def _by_node(_: Mapping[str, Any], given: tuple[NodeLimits, ...]) -> dict[str, dict[str, int]]:
+    return {one.node: {BY_WORD[word].key: value for word, value in one.limits} for one in given}
+
+
 NODE_LIMIT = Setting[tuple[NodeLimits, ...]](
     "node_limit",
     texts_of_nodes(
@@ -86,6 +102,7 @@ NODE_LIMIT = Setting[tuple[NodeLimits, ...]](
     ),
     (),
     f"Limits of one node: {', '.join(limit.word for limit in LIMITS)}.",
+    by_node=_by_node,
 )
 NICE = Setting[int | None](
     "nice",
@@ -126,6 +143,7 @@ CPUS = Setting[int | None](
     None,
     "CPUs that the node may use, such as 2-3 or 0,2.",
     only_nodes=True,
+    check=_check,
 )
 LIVE_SETTINGS: tuple[Setting[Any], ...] = (
     *(_limit_setting(key, help_text) for key, help_text in _HELPS.items()),
@@ -135,4 +153,4 @@ LIVE_SETTINGS: tuple[Setting[Any], ...] = (
 """Settings that can be changed while the dataflow is running."""
 
 LIMIT_SETTINGS: tuple[Setting[Any], ...] = (*LIVE_SETTINGS, NICE, REALTIME, DEVICE)
-RUNNER_SETTINGS = {NICE.name: NICE}
+RUNNER_SETTINGS = {one.name: one for one in (*LIVE_SETTINGS, NICE) if one is not NODE_LIMIT}

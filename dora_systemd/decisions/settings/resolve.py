@@ -9,12 +9,16 @@ from functools import reduce
 from pathlib import PurePath
 from typing import Any, TypeVar, cast
 
-from dora_systemd.decisions.cell.environment import changed
 from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_limits, node_limits
-from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
 from dora_systemd.decisions.cell.needs import split_needs
-from dora_systemd.decisions.cell.options import MODULES, RunnerOptions, SettingText, parse_setting
+from dora_systemd.decisions.cell.options import (
+    MODULES,
+    RunnerOptions,
+    SettingText,
+    changed,
+    parse_setting,
+)
 from dora_systemd.decisions.cell.owes import RESTART, base_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
@@ -32,7 +36,6 @@ from dora_systemd.decisions.settings.table import (
     DEBUG,
     EXIT_WHEN_NODES_FINISH,
     GRACE_DURATION,
-    LOG_RATE_LIMIT,
     SETTINGS,
     UV,
 )
@@ -238,20 +241,18 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         allow_shell_nodes=settings[ALLOW_SHELL_NODES],
         grace=settings[GRACE_DURATION],
         exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
-        log_rates=log_rates(settings),
-        node_limits=settings_node_limits(settings),
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
         watchdogs=watchdogs(settings),
         needs=split_needs(settings[NEEDS], settings.by_node(NEEDS))[1],
         reload=hot_reload(settings, options.working_directory),
-        settings=changed(tuple(_runner_texts(settings)), settings.passed),
+        settings=changed(tuple(runner_texts(settings)), settings.passed),
         on_failure=settings[ON_FAILURE],
     )
 
 
-def _runner_texts(settings: Settings) -> Iterator[SettingText]:
+def runner_texts(settings: Settings) -> Iterator[SettingText]:
     """The settings that the runner receives as text, as far as they are given."""
     table = {setting.name: setting for setting in settings.table}
     for node, values in _by_node(settings).items():
@@ -272,14 +273,6 @@ def _by_node(settings: Settings) -> dict[str, dict[str, Any]]:
         elif setting.name in MODULES and not setting.property and settings.is_given(setting):
             found[""][setting.name] = settings[setting]
     return found
-
-
-def log_rates(settings: Settings) -> RateLimits:
-    """The limits of `log_rate_limit`, which take precedence over those of `nodes:` in files.
-
-    Raises DoraSystemdError (BAD_INPUT).
-    """
-    return merge_rates(settings.by_node(LOG_RATE_LIMIT), settings[LOG_RATE_LIMIT])
 
 
 def watchdogs(settings: Settings) -> Watchdogs:

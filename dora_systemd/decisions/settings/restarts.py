@@ -2,11 +2,17 @@
 
 from typing import Any
 
-from dora_systemd.decisions.cell.limits import format_number
 from dora_systemd.decisions.cell.restarts import DEFAULT, POLICIES, parse_count, parse_delay
 from dora_systemd.decisions.settings.kinds import DURATION, Base, Kind, Setting, one_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import INFINITY, format_duration, parse_duration, quoted, scalar_text
+from dora_systemd.values import (
+    INFINITY,
+    format_duration,
+    format_number,
+    parse_duration,
+    quoted,
+    scalar_text,
+)
 
 
 def _parse_choice(value: Any, _: Base) -> str:

@@ -7,14 +7,12 @@ or checked against it. A new setting is one more assignment.
 from collections.abc import Mapping
 from typing import Any
 
-from dora_systemd.decisions.cell.line_rates import RateLimits
 from dora_systemd.decisions.cell.options import DEFAULT_GRACE
 from dora_systemd.decisions.settings.credentials import CREDENTIAL_SETTINGS
 from dora_systemd.decisions.settings.kinds import (
     BOOL,
     DURATION,
     ENVIRONMENT,
-    LINE_RATES,
     PATH,
     PATHS,
     PROGRAM,
@@ -23,6 +21,7 @@ from dora_systemd.decisions.settings.kinds import (
     Setting,
 )
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, LIVE_SETTINGS
+from dora_systemd.decisions.settings.log_rates import LOG_RATE_LIMIT
 from dora_systemd.decisions.settings.machines import MACHINE_SETTINGS
 from dora_systemd.decisions.settings.needs import NEED_SETTINGS
 from dora_systemd.decisions.settings.on_failure import NOTICE_SETTINGS
@@ -87,21 +86,20 @@ EXIT_WHEN_NODES_FINISH = Setting[bool | None](
     "End the dataflow when its nodes have finished; default: as in the dataflow file.",
 )
 DORA = Setting[str]("dora", PROGRAM, "dora", "The dora program to run.", variable="DORA_PROGRAM")
-LOG_RATE_LIMIT = Setting[RateLimits](
-    "log_rate_limit",
-    LINE_RATES,
-    {},
-    "Log lines per time to keep of each node, or of NODE; the rest is dropped and counted.",
-    variable="DORA_LOG_RATE_LIMIT",
-    per_node=True,
-)
 
 CHANGEABLE: tuple[Setting[Any], ...] = (*LIVE_SETTINGS, LOG_RATE_LIMIT)
 """Settings that `doractl set` changes while the dataflow is running."""
 
 SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     # All settings above, in this order, so that a setting is declared in one place only.
-    "Nodes": tuple(value for value in list(globals().values()) if isinstance(value, Setting)),
+    "Nodes": (
+        *(
+            value
+            for value in list(globals().values())
+            if isinstance(value, Setting) and value is not LOG_RATE_LIMIT
+        ),
+        LOG_RATE_LIMIT,
+    ),
     "Needs": NEED_SETTINGS,
     "Limits": LIMIT_SETTINGS,
     "Rights of nodes": RIGHTS_SETTINGS,

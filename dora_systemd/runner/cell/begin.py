@@ -13,7 +13,7 @@ from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN, keeps_core_dumps
 from dora_systemd.decisions.cell.environment import find_python, node_environment, with_place
-from dora_systemd.decisions.cell.limits import has_cpus
+from dora_systemd.decisions.cell.limits import has_cpus, limits_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import rights_of
 from dora_systemd.paths import CellPaths
@@ -129,7 +129,7 @@ def daemon_variables(
 
 
 def _rights(options: RunnerOptions, unit: Path) -> dict[str, str]:
-    if not rights_of(options) and not any(map(has_cpus, options.node_limits)):
+    if not rights_of(options) and not any(map(has_cpus, limits_of(options))):
         return {}
     # Imported late: most dataflows have neither.
     from dora_systemd.runner.nodes.rights import launcher_rights

@@ -7,7 +7,7 @@ from pathlib import Path
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.preparation import check_named_nodes
 from dora_systemd.adapters.host.rights import check_cpus, prove_rights, read_base
-from dora_systemd.decisions.cell.limits import CPUS, has_cpus
+from dora_systemd.decisions.cell.limits import CPUS, has_cpus, limits_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import (
     NodeRights,
@@ -27,7 +27,7 @@ def launcher_rights(options: RunnerOptions, unit: Path) -> str:
     unit: cgroup directory. Without a cpuset controller the launcher binds nodes to their CPUs.
     """
     has_cpuset = cgroup.CPUSET in cgroup.read_controllers(unit)
-    loose = () if has_cpuset else filter(has_cpus, options.node_limits)
+    loose = () if has_cpuset else filter(has_cpus, limits_of(options))
     bound = {one.node: format_cpus(dict(one.limits)[CPUS]) for one in loose}
     if not rights_of(options) and not bound:
         return ""
@@ -48,5 +48,5 @@ def check_first(
     check_named_nodes(options, dataflow)
     # A dry run of a user is in no unit, and has the rights of that shell.
     if _OF_UNITS.search(group or cgroup.group_of()):
-        check_cpus(options.node_limits)
+        check_cpus(limits_of(options))
         prove(rights_of(options))

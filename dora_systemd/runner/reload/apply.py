@@ -10,6 +10,8 @@ from typing import Any
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.launch import has_pipes, kinds
+from dora_systemd.decisions.cell.limits import limits_of
+from dora_systemd.decisions.cell.line_rates import rates_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import owes_of
 from dora_systemd.decisions.cell.status import HELD
@@ -127,7 +129,7 @@ class Applier:
         if step.how is How.ADD:
             node = prepared.dataflow.node(step.node)
             assert node is not None
-            self.run.nodes.add(node, self._options.log_rates, self._options.node_limits)
+            self.run.nodes.add(node, rates_of(self._options), limits_of(self._options))
             await swapper.add(definition, kind)
         elif step.how is How.REWIRE:
             await swapper.rewire(definition, kind)

@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
@@ -16,9 +16,9 @@ from typing import Any
 from dora_systemd.adapters.dora.preparation import Prepared, resolved
 from dora_systemd.adapters.host.watch import Since, identity
 from dora_systemd.adapters.runner_socket.client import unknown_request
-from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
-from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
-from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.limits import check_nodes, limit_texts
+from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates, rate_texts
+from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, changed
 from dora_systemd.decisions.cell.rights import essential_nodes, rights_of
 from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
@@ -252,8 +252,7 @@ class Reloader:
         check_nodes(change.limits, run.pump.cell.nodes, ())
         run.nodes.limit(change.limits)
         self._settings.accept()
-        merged = merge_node_limits(self.options.node_limits, change.limits)
-        self.options = self.options._replace(node_limits=merged)
+        self._change(limit_texts(change.limits))
         name = PurePath(self._settings.path).name
         for one in change.limits:
             run.pipes.write_event("node-reloaded", one.node, how="given new limits", reason=name)
@@ -356,9 +355,13 @@ class Reloader:
             await self._watcher.wait_seeing()
         return {"done": []}
 
+    def _change(self, texts: Iterable[SettingText]) -> None:
+        self.options = self.options._replace(settings=changed(self.options.settings, texts))
+
     async def _limit_lines(self, rates: RateLimits) -> Answer:
         async with self._lock:
-            self.options = self.options._replace(log_rates=rates)
+            self.options = self.options.without("log_rate_limit")
+            self._change(rate_texts(rates))
             if self._run is not None:
                 self._run.nodes.limit_lines(rates)
         return {"done": []}

@@ -11,8 +11,7 @@ import sys
 from pathlib import Path
 
 from dora_systemd.adapters.host import files, process
-from dora_systemd.decisions.cell.hot_reload import SettingsChange
-from dora_systemd.decisions.cell.limits import format_node_limits, parse_node_limits
+from dora_systemd.decisions.cell.limits import SettingsChange, format_node_limits, parse_node_limits
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.limits import CPUS, has_cpus
+from dora_systemd.decisions.cell.limits import CPUS, has_cpus, limits_of
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE, GATHERING, CellStatus
 from dora_systemd.decisions.resources.usage import (
@@ -181,7 +181,7 @@ def _right_facts(rights: "dict[str, NodeRights] | None", node: str) -> dict[str,
 def _cpus(reading: Reading, node: str) -> str:
     """The CPUs of a node, if the settings name some; "" in the table."""
     options = reading.cell.known_options
-    asked = [one for one in options.node_limits if one.node == node] if options else []
+    asked = [one for one in limits_of(options) if one.node == node] if options else []
     if not any(map(has_cpus, asked)):
         return ""
     # `doractl set` may have changed them. Without a cpuset controller the launcher binds the node.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, has_cpus, without_cpus
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, has_cpus, limits_of, without_cpus
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.settings.limit_checks import (
     Machine,
@@ -29,7 +29,7 @@ def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[
 
     Raises DoraSystemdError (NO_SYSTEMD) for a limit that nothing would enforce.
     """
-    nodes, machine = plan.options.node_limits, read_machine()
+    nodes, machine = limits_of(plan.options), read_machine()
     check_cpus(nodes, machine)
     # Without a cpuset controller the launcher binds nodes to their CPUs.
     require_controllers(manager, plan.scope, properties, tuple(map(without_cpus, nodes)))

@@ -9,7 +9,7 @@ from pathlib import Path
 from dora_systemd.adapters.dora.preparation import PACKAGE
 from dora_systemd.adapters.host.files import absolute_path
 from dora_systemd.decisions.cell.launch import LaunchPlan, python_of
-from dora_systemd.decisions.cell.limits import has_cpus
+from dora_systemd.decisions.cell.limits import has_cpus, limits_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import has_process_rights, rights_of
 from dora_systemd.decisions.cell.uv import uv_project
@@ -63,7 +63,7 @@ def make_sandbox(
         or _names(settings, "DeviceAllow"),
         has_can=needs_can(options.needs),
         is_realtime=settings[REALTIME] is not None or any(one.priority for one in rights),
-        has_rights=has_process_rights(rights) or any(map(has_cpus, options.node_limits)),
+        has_rights=has_process_rights(rights) or any(map(has_cpus, limits_of(options))),
         # In a user namespace the given capabilities would have no effect.
         has_identity=_has_identity(user, offers_identity) and not _names(settings, *_CAPABILITIES),
         needed=needed,

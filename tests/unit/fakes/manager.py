@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Beside, Observer, Property, UnitState
+from dora_systemd.decisions.cell.limits import NodeLimits, limit_texts
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     SettingText,
@@ -51,6 +52,10 @@ def options(name: str = "robot", uuid: str = UUID, **more: Any) -> RunnerOptions
 def with_texts(options: RunnerOptions, *texts: str) -> RunnerOptions:
     """The options with [NODE:]KEY=TEXT."""
     return options._replace(settings=(*options.settings, *map(parse_setting, texts)))
+
+
+def with_limits(options: RunnerOptions, *limits: NodeLimits) -> RunnerOptions:
+    return _with(options, limit_texts(limits))
 
 
 def with_rights(options: RunnerOptions, *rights: NodeRights) -> RunnerOptions:

@@ -7,14 +7,13 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.host.unit_files import (
-    LOG_RATES_FILE,
-    NODE_LIMITS_FILE,
+    SET_FILE,
     changed_files,
     remove_changes,
 )
 from dora_systemd.decisions.cell.environment import node_environment, with_changes
-from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.cell.line_rates import parse_rates
+from dora_systemd.decisions.cell.limits import limits_of, parse_node_limits
+from dora_systemd.decisions.cell.line_rates import parse_rates, rates_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import runner_command
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
@@ -24,7 +23,7 @@ from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
 from tests.unit.fakes.cgroups import fake_cgroups
-from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options, with_limits, with_texts
 
 NODES = {"camera": NodeStatus("running", 5, kind="python"), "ui": NodeStatus(kind="dynamic")}
 FILES = ("memory.max", "cpu.max", "pids.max", "memory.current")
@@ -66,7 +65,7 @@ class Place:
 
     @property
     def drop_in(self) -> Path:
-        return self.units / "dora-robot.service.d" / NODE_LIMITS_FILE
+        return self.units / "dora-robot.service.d" / SET_FILE
 
     def set(self, **flags: Any) -> tuple[str, ...]:
         return set_limits(self.manager, self.scope, self.cell, flags)
@@ -92,7 +91,7 @@ def test_limits_of_a_node_hold_now_and_later(place: Place) -> None:
     assert (place.group / "cpu.max").read_text() == "150000 100000"
     assert place.drop_in.read_text().splitlines()[1:] == [
         "[Service]",
-        "Environment=DORA_SYSTEMD_NODE_LIMITS=camera:cpu=150%%,memory=2M",
+        'Environment="DORA_SYSTEMD_SET=camera:cpu_limit=150%% camera:memory_limit=2M"',
     ]
 
 
@@ -101,18 +100,25 @@ def test_a_unit_file_keeps_its_changes_until_it_goes(place: Place) -> None:
     place.set(node_limit=("camera:memory=2M",))
     fragment = place.units / "dora-robot.service"
     (drop_in,) = changed_files(fragment)
-    assert drop_in == place.root / "units.control/dora-robot.service.d" / NODE_LIMITS_FILE
+    assert drop_in == place.root / "units.control/dora-robot.service.d" / SET_FILE
     remove_changes(fragment)
     assert not drop_in.parent.exists()
     remove_changes(fragment)
 
 
 def test_changes_add_up(place: Place) -> None:
-    before = "DORA_SYSTEMD_NODE_LIMITS=camera:cpu=150%,memory=2M other:tasks=3"
+    before = "DORA_SYSTEMD_SET=camera:cpu_limit=150% camera:memory_limit=2M other:tasks_limit=3"
     place.manager.units[place.unit]["Environment"].append(before)
     place.set(node_limit=("camera:memory=infinity,tasks=9",), tasks_limit="50")
     assert [call[0] for call in place.manager.calls] == ["set", "reload"]
-    assert "camera:cpu=150%%,memory=infinity,tasks=9 other:tasks=3" in place.drop_in.read_text()
+    assert (
+        place.drop_in.read_text()
+        .rstrip()
+        .endswith(
+            "camera:cpu_limit=150%% other:tasks_limit=3 camera:memory_limit=infinity"
+            ' camera:tasks_limit=9"'
+        )
+    )
     assert (place.group / "memory.max").read_text() == "max"
 
 
@@ -126,7 +132,7 @@ def test_what_is_too_small_or_too_large_is_said(place: Place) -> None:
     flags = {"node_limit": ("camera:memory=2M",), "cpu_limit": "99999"}
     (warning,) = set_limits(place.manager, place.scope, place.cell, flags, is_forced=True)
     assert "than this machine has" in warning
-    assert "camera:memory=2M" in place.drop_in.read_text()
+    assert "camera:memory_limit=2M" in place.drop_in.read_text()
 
 
 def test_a_limit_below_what_the_dataflow_uses(place: Place) -> None:
@@ -205,7 +211,7 @@ def test_a_node_without_a_group_is_limited_at_its_next_start(place: Place) -> No
         (place.group / name).unlink()
     place.group.rmdir()
     place.set(node_limit=("camera:memory=2M",))
-    assert "camera:memory=2M" in place.drop_in.read_text()
+    assert "camera:memory_limit=2M" in place.drop_in.read_text()
 
 
 def test_root_is_needed_for_others(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,11 +244,13 @@ def rates(place: Place, *texts: str, runner: Runner, **flags: Any) -> tuple[str,
 
 def test_lines_of_a_running_dataflow(place: Place) -> None:
     runner = Runner()
-    place.manager.units[place.unit]["Environment"] = ["DORA_SYSTEMD_LOG_RATES=ui=9/1s,50/1min 30s"]
+    place.manager.units[place.unit]["Environment"] = [
+        "DORA_SYSTEMD_SET=ui:log_rate_limit=9/1s 'log_rate_limit=50/1min 30s'"
+    ]
     rates(place, "camera=10/1s", "100/1s", runner=runner)
-    assert runner.asked == [["ui=9/1s", "100/1s", "camera=10/1s"]]
-    text = place.drop_in.with_name(LOG_RATES_FILE).read_text()
-    assert "Environment=DORA_SYSTEMD_LOG_RATES=ui=9/1s,100/1s,camera=10/1s\n" in text
+    assert runner.asked == [["100/1s", "ui=9/1s", "camera=10/1s"]]
+    text = place.drop_in.with_name(SET_FILE).read_text()
+    assert "ui:log_rate_limit=9/1s log_rate_limit=100/1s camera:log_rate_limit=10/1s" in text
     assert place.manager.calls == [("reload",)]
 
 
@@ -258,7 +266,7 @@ def test_lines_of_one_that_does_not_run(place: Place) -> None:
     place.manager.units[place.unit]["ControlGroup"] = ""
     rates(place, "camera=infinity", runner=runner)
     assert runner.asked == []
-    assert "camera=infinity" in place.drop_in.with_name(LOG_RATES_FILE).read_text()
+    assert "camera:log_rate_limit=infinity" in place.drop_in.with_name(SET_FILE).read_text()
 
 
 def test_a_rate_that_nobody_takes_changes_nothing(place: Place) -> None:
@@ -285,18 +293,19 @@ def test_lines_that_systemd_refuses(place: Place, monkeypatch: pytest.MonkeyPatc
 
 
 def test_lines_of_the_next_runner() -> None:
-    before = options(log_rates=parse_rates(["9/1s", "camera=8/1s"]))
-    variables = {"DORA_SYSTEMD_LOG_RATES": "camera=infinity,ui=50/1min 30s"}
+    before = with_texts(options(), "log_rate_limit=9/1s", "camera:log_rate_limit=8/1s")
+    texts = "camera:log_rate_limit=infinity 'ui:log_rate_limit=50/1min 30s'"
+    variables = {"DORA_SYSTEMD_SET": texts}
     expected = parse_rates(["9/1s", "camera=infinity", "ui=50/90s"])
-    assert with_changes(before, variables).log_rates == expected
+    assert rates_of(with_changes(before, variables)) == expected
     assert node_environment(variables) == {}
 
 
 def test_the_runner_is_told() -> None:
-    before = options(node_limits=(parse_node_limits("camera:cpu=1,memory=1G"),))
-    variables = {"DORA_SYSTEMD_NODE_LIMITS": "camera:memory=2G ui:tasks=9"}
-    assert with_changes(before, {}).node_limits == before.node_limits
-    assert with_changes(before, variables).node_limits == (
+    before = with_limits(options(), parse_node_limits("camera:cpu=1,memory=1G"))
+    variables = {"DORA_SYSTEMD_SET": "camera:memory_limit=2G ui:tasks_limit=9"}
+    assert with_changes(before, {}) == before
+    assert limits_of(with_changes(before, variables)) == (
         parse_node_limits("camera:cpu=1,memory=2G"),
         parse_node_limits("ui:tasks=9"),
     )

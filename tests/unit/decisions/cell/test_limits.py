@@ -10,6 +10,7 @@ from dora_systemd.decisions.cell.limits import (
     NodeLimits,
     check_nodes,
     format_node_limits,
+    limits_of,
     merge_node_limits,
     node_limits,
     parse_node_limits,
@@ -22,10 +23,11 @@ from dora_systemd.decisions.settings.limit_checks import (
     size_warnings,
 )
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
-from dora_systemd.decisions.settings.resolve import Settings, resolve_settings, settings_node_limits
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings, with_settings
 from dora_systemd.decisions.unit.properties import realtime_properties, settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
+from tests.unit.fakes.dialogue import OPTIONS
 from tests.unit.fakes.limit_values import limits_of_a_node
 
 GIB = 1 << 30
@@ -153,7 +155,7 @@ def test_sources_of_node_limits() -> None:
     beside = {"nodes": {"a": {"memory_limit": "1G", "cpu_limit": 2}, "b": {"tasks_limit": 5}}}
     system = {"nodes": {"a": {"cpu_limit": 1}, "c": {"io_weight": 7}}}
     settings = resolved({"node_limit": ("a:memory=2G", "d:cpu=1")}, beside, system)
-    assert {format_node_limits(one) for one in settings_node_limits(settings)} == {
+    assert {format_node_limits(one) for one in limits_of(with_settings(OPTIONS, settings))} == {
         "a:cpu=200%,memory=2G",
         "b:tasks=5",
         "c:io-weight=7",

@@ -11,6 +11,7 @@ from dora_systemd.decisions.cell.line_rates import (
     SHORTEST,
     LineLimiter,
     RateLimit,
+    RateLimits,
     check_rates,
     format_rate,
     format_rates,
@@ -18,10 +19,12 @@ from dora_systemd.decisions.cell.line_rates import (
     parse_rate,
     parse_rates,
     rate_of,
+    rates_of,
 )
-from dora_systemd.decisions.settings.resolve import Settings, log_rates, resolve_settings
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings, with_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
+from tests.unit.fakes.dialogue import OPTIONS
 
 LIMIT = RateLimit(3, SECOND)
 RATES = st.builds(RateLimit, st.integers(1, 10**18 - 1), st.integers(SHORTEST, INFINITY - 1))
@@ -68,6 +71,10 @@ def test_limits_of_nodes() -> None:
     assert rate_of({}, "other") is None
 
 
+def rates_of_settings(settings: Settings) -> RateLimits:
+    return rates_of(with_settings(OPTIONS, settings))
+
+
 def settings(flags: tuple[str, ...] = (), document: object = None) -> Settings:
     return resolve_settings({"log_rate_limit": flags}, {}, [("/srv/robot.systemd.yml", document)])
 
@@ -77,16 +84,18 @@ def test_a_flag_for_a_node_wins_and_one_for_all_does_not() -> None:
         "log_rate_limit": "9/1s",
         "nodes": {"camera": {"log_rate_limit": "5/1s"}, "lidar": {"log_rate_limit": "infinity"}},
     }
-    texts = format_rates(log_rates(settings(("camera=1/1s", "8/1s"), document)))
+    texts = format_rates(rates_of_settings(settings(("camera=1/1s", "8/1s"), document)))
     assert sorted(texts) == ["8/1s", "camera=1/1s", "lidar=infinity"]
     variables = {"DORA_LOG_RATE_LIMIT": "7/1s"}
-    assert log_rates(resolve_settings({}, variables, [])) == {ALL_NODES: RateLimit(7, SECOND)}
+    assert rates_of_settings(resolve_settings({}, variables, [])) == {
+        ALL_NODES: RateLimit(7, SECOND)
+    }
 
 
 def test_a_node_in_a_file_cannot_name_another() -> None:
     document = {"nodes": {"camera": {"log_rate_limit": "lidar=5/1s"}}}
     with pytest.raises(DoraSystemdError, match=r"'lidar=5/1s' as log_rate_limit of node camera"):
-        log_rates(settings((), document))
+        rates_of_settings(settings((), document))
     assert merge_rates({}, {}) == {}
 
 

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS, HotReload
-from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.cell.line_rates import ALL_NODES, SHORTEST, RateLimit
+from dora_systemd.decisions.cell.line_rates import ALL_NODES
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import (
     MODULES,
@@ -26,7 +25,6 @@ from dora_systemd.decisions.cell.owes import SHORTEST as SHORTEST_TIME
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
-from tests.unit.fakes.limit_values import limits_of_a_node
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora")
@@ -35,7 +33,6 @@ texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]
 paths = texts.map(lambda text: "/" + text)
 idents = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 nodes = st.just(ALL_NODES) | idents
-rates = st.builds(RateLimit, st.integers(1, 10**18 - 1), st.integers(SHORTEST, INFINITY - 1))
 times = st.integers(1, 10**12)
 policies = st.builds(
     RestartPolicy,
@@ -67,11 +64,10 @@ options = st.builds(
     machine=st.just(""),
     head=st.just(""),
     addresses=st.just(()),
+    on_failure=st.just(()),
     attached=st.booleans(),
     exit_when_nodes_finish=st.none() | st.booleans(),
     env_keys=st.lists(texts).map(tuple),
-    log_rates=st.dictionaries(nodes, st.none() | rates),
-    node_limits=st.lists(limits_of_a_node()).map(tuple),
     restart=policies,
     node_restarts=st.lists(st.tuples(st.text(min_size=1), policies)).map(tuple),
     start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
@@ -106,8 +102,6 @@ ALL = RunnerOptions(
     attached=True,
     exit_when_nodes_finish=False,
     env_keys=("MODEL", "RATE"),
-    log_rates={ALL_NODES: RateLimit(1000, SECOND), "camera": None},
-    node_limits=(parse_node_limits("camera:cpu=1.5,memory=1G"),),
     restart=RestartPolicy("on-failure"),
     node_restarts=(("a:b", RestartPolicy("always", INFINITY, INFINITY, SECOND, SECOND)),),
     start_timeout=90 * SECOND,
@@ -124,8 +118,7 @@ ARGUMENTS = f"""\
 --name=robot --uuid={UUID} --working-directory=/srv --dora=/usr/bin/dora --grace-duration=5s
 --venv=/srv/venv --exit-when-nodes-finish=no
 --restart=on-failure,max=5,window=10min,delay=500ms,max-delay=30s '--start-timeout=1min 30s'
---env-key=MODEL --env-key=RATE --log-rate-limit=1000/1s --log-rate-limit=camera=infinity
---node-limit=camera:cpu=150%,memory=1G
+--env-key=MODEL --env-key=RATE
 --node-restart=a:b:always,max=infinity,window=infinity,delay=1s,max-delay=1s
 --set=camera:nice=5 '--set=camera:owes=/image:within=2s,first=1min 30s,then=warn'
 --set=stop_limit=1h

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
-from dora_systemd.decisions.cell.limits import NodeLimits
+from dora_systemd.decisions.cell.limits import limits_of, node_limits
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -26,6 +26,7 @@ from dora_systemd.decisions.machines.part import (
 )
 from dora_systemd.decisions.watchdog.watchdogs import Watchdogs
 from dora_systemd.errors import DoraSystemdError
+from tests.unit.fakes.manager import with_limits
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 PLACED = (Placed("mid", "gpu"),)
@@ -74,8 +75,8 @@ def test_a_member_leaves_out_what_its_settings_say_of_other_machines() -> None:
     head, member = plan().options, plan(machine="gpu").options
     assert own_options(head._replace(needs=(need,))).needs == (need,)
     assert own_options(member._replace(needs=(need,))).needs == ()
-    limits = NodeLimits("source", ()), NodeLimits("mid", ())
-    assert own_options(member._replace(node_limits=limits)).node_limits == limits[1:]
+    limits = node_limits("source", {"tasks": 1}), node_limits("mid", {"tasks": 2})
+    assert limits_of(own_options(with_limits(member, *limits))) == limits[1:]
 
 
 def test_a_launch_file_starts_the_node_whatever_its_words_are(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.cell.limits import limits_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.decisions.cell.options import format_runner_argv as runner_argv
@@ -106,15 +107,15 @@ def test_what_a_member_is_told() -> None:
         f"--uuid={UUID}",
         "--head=robot-1.lan",
         "--placed=yolo=gpu",
+        "--set=yolo:memory_limit=4G",
         "--sandbox=none",
-        "--node-limit=yolo:memory=4G",
         "--watchdog=yolo=5s",
         "--working-directory=/home/alice/robot",
         "--env=B=2",
         "--venv=/home/alice/robot/venv",
         "--memory-limit=8G",
     )
-    assert [one.node for one in options.node_limits] == ["camera"]
+    assert [one.node for one in limits_of(options)] == ["camera"]
     assert [one.node for one in options.needs] == ["camera"]
     assert not options.watchdogs
 

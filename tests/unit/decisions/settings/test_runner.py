@@ -1,6 +1,6 @@
 """A setting travels as text: to the runner, to a member, and through `doractl set`."""
 
-import json
+import shlex
 from typing import Any
 
 import pytest
@@ -97,7 +97,7 @@ def test_a_concern_refuses_more() -> None:
 
 
 def with_variable(options: RunnerOptions, texts: Any) -> RunnerOptions:
-    return with_changes(options, {SET_VARIABLE: json.dumps(texts)})
+    return with_changes(options, {SET_VARIABLE: shlex.join(texts)})
 
 
 def test_a_change_takes_the_place_of_the_value() -> None:

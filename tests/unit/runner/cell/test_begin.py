@@ -31,7 +31,7 @@ from dora_systemd.runner.cell.begin import (
     start_daemon,
 )
 from tests.unit.fakes.cgroups import fake_cgroups
-from tests.unit.fakes.manager import options
+from tests.unit.fakes.manager import options, with_limits
 from tests.unit.fakes.programs import make_program
 
 OWN = ("DORA_QUIET", "RUST_BACKTRACE", "PERL_BADLANG")
@@ -169,10 +169,10 @@ def test_nodes_have_what_a_prompt_has(monkeypatch: pytest.MonkeyPatch, home: str
 
 
 def test_cpus_of_a_node_are_told_where_no_cgroup_binds_it(paths: CellPaths, tmp_path: Path) -> None:
-    bound = options(node_limits=(parse_node_limits("a:cpus=0"),))
+    bound = with_limits(options(), parse_node_limits("a:cpus=0"))
     told = daemon_variables(bound, paths, tmp_path, {})["DORA_SYSTEMD_RIGHTS"]
     assert told == "a /usr/bin/taskset -c 0\n* \n"
-    limited = options(node_limits=(parse_node_limits("a:memory=1G"),))
+    limited = with_limits(options(), parse_node_limits("a:memory=1G"))
     assert "DORA_SYSTEMD_RIGHTS" not in daemon_variables(limited, paths, tmp_path, {})
 
 

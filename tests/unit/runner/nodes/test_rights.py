@@ -12,13 +12,13 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import daemon_variables
 from dora_systemd.runner.nodes.rights import check_first, launcher_rights
-from tests.unit.fakes.manager import options, with_rights
+from tests.unit.fakes.manager import options, with_limits, with_rights
 
 FLOW = parse_dataflow({"nodes": [{"id": "camera", "path": "camera.py"}]}, "robot.yml")
 
 
 def with_cpus() -> RunnerOptions:
-    return options(node_limits=(parse_node_limits("camera:cpus=0,memory=1G"),))
+    return with_limits(options(), parse_node_limits("camera:cpus=0,memory=1G"))
 
 
 def variables(unit: Path, given: RunnerOptions) -> dict[str, str]:
@@ -26,7 +26,7 @@ def variables(unit: Path, given: RunnerOptions) -> dict[str, str]:
 
 
 def test_most_dataflows_have_none(tmp_path: Path) -> None:
-    limited = options(node_limits=(parse_node_limits("camera:memory=1G"),))
+    limited = with_limits(options(), parse_node_limits("camera:memory=1G"))
     for given in (options(), limited):
         assert "DORA_SYSTEMD_RIGHTS" not in variables(tmp_path, given)
 

@@ -11,8 +11,8 @@ from typing import Any, cast
 import pytest
 
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
-from dora_systemd.decisions.cell.hot_reload import SettingsChange
-from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
+from dora_systemd.decisions.cell.limits import SettingsChange
+from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates, rates_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -163,11 +163,11 @@ def test_limits_of_lines(tmp_path: Path) -> None:
         for begin in (lambda: None, bench.begin):
             begin()
             await bench.reloader.answer({"verb": "log-rates", "limits": ["9/1s", "a=infinity"]})
-            assert bench.reloader.options.log_rates == rates
+            assert rates_of(bench.reloader.options) == rates
         assert bench.limited == [rates]
         with pytest.raises(DoraSystemdError, match="cannot read 'x' as a rate"):
             await bench.reloader.answer({"verb": "log-rates", "limits": ["x"]})
-        assert bench.reloader.options.log_rates == rates
+        assert rates_of(bench.reloader.options) == rates
         bench.reloader.close()
 
     live(work)

@@ -17,7 +17,7 @@ from dora_systemd.trust.files import read_times
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import dataflow_row
-from tests.unit.fakes.manager import FakeManager, options, with_owes, with_rights
+from tests.unit.fakes.manager import FakeManager, options, with_limits, with_owes, with_rights
 from tests.unit.verbs.facts.test_list import GROUP, scope, unit_group, write_status
 
 __all__ = ["scope", "unit_group"]
@@ -50,7 +50,7 @@ def test_cpus(scope: Scope, unit_group: Path, now: str) -> None:
         (unit_group / "node-camera/cpuset.cpus").write_text(now)
     manager = FakeManager()
     limits = (parse_node_limits("camera:cpus=2-3"), parse_node_limits("plot:memory=1G"))
-    manager.add(options(node_limits=limits), ControlGroup=GROUP)
+    manager.add(with_limits(options(), *limits), ControlGroup=GROUP)
     nodes = {one: NodeStatus("running") for one in ("camera", "plot", "ui")}
     write_status(scope, CellStatus(nodes=nodes))
     rows = dataflow_row(manager, scope, read_cells(manager)[0]).nodes
