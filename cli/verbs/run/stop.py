@@ -159,8 +159,8 @@ def _wait(bus: Bus, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
 
 def _wait_on(scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
     """Wait for a stop that may save data; kill what still runs after another Ctrl+C."""
-    tell("doractl: the stop continues; Ctrl+C again kills the nodes that still run", err=True)
     try:
+        tell("doractl: the stop continues; Ctrl+C again kills the nodes that still run", err=True)
         return _wait(Bus(scope), scope, cells)
     except KeyboardInterrupt:
         return stop_cells_within(Bus(scope), scope, cells, 0)
