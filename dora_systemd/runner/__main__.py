@@ -22,7 +22,7 @@ from dora_systemd.runner.cell.begin import (
     nodes_environment,
     start_coordinator,
 )
-from dora_systemd.runner.cell.restarts import pause
+from dora_systemd.runner.cell.restarts import pause, report_last_life
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
@@ -44,6 +44,7 @@ def begin(argv: list[str]) -> "Begun | None":
             options = parse_runner_argv(argv)
             unit = enter_supervisor()
             paths = CellPaths(Path(directory))
+            report_last_life(options, os.environ)
             pause(options, paths)
             environment = nodes_environment(options.working_directory)
             if options.placed:

@@ -16,6 +16,7 @@ Most imports are late: they take longer than everything before the coordinator.
 import contextlib
 import os
 import time
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import HEAD_START, RestartPolicy, count_restarts
 from dora_systemd.errors import DoraSystemdError, RestartsSpent
 from dora_systemd.names import unit_name
-from dora_systemd.paths import CellPaths
+from dora_systemd.paths import CellPaths, request_directory
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
 _ASK_SECONDS = 5.0
@@ -49,6 +50,18 @@ def pause(options: RunnerOptions, paths: CellPaths) -> None:
             show(options.uuid, paths, seconds)
             time.sleep(seconds)
     fd_store.count_life(_now_us())
+
+
+def report_last_life(options: RunnerOptions, environment: Mapping[str, str]) -> None:
+    """Request a notice of the life that has failed before this automatic restart.
+
+    systemd 254 starts the units of OnFailure= at each failure, and sets $FDSTORE; earlier versions
+    start them only if no restart follows. The earlier life has left descriptors, see fd_store.
+    """
+    directory = request_directory(environment) if options.on_failure else ""
+    if directory and "FDSTORE" not in environment and environment.get("LISTEN_FDNAMES"):
+        with contextlib.suppress(OSError):
+            Path(directory, "request").touch(0o600)
 
 
 def find_spent(options: RunnerOptions, paths: CellPaths) -> RestartsSpent | None:

@@ -33,6 +33,7 @@ from dora_systemd.runner.cell.restarts import (
     is_transient,
     learn_first,
     pause,
+    report_last_life,
     show,
 )
 from dora_systemd.values import INFINITY, SECOND
@@ -246,6 +247,26 @@ def test_it_is_seen(unit: Unit) -> None:
 def test_nothing_restarts(unit: Unit) -> None:
     assert [unit.start(n, POLICY._replace(policy="no")) for n in range(5)] == [0] * 5
     assert "dora-life" not in unit.store
+
+
+@pytest.mark.parametrize(
+    ("words", "environment", "is_requested"),
+    [
+        (("/bin/tell",), {"LISTEN_FDNAMES": "dora-life"}, True),
+        (("/bin/tell",), {}, False),
+        (("/bin/tell",), {"LISTEN_FDNAMES": "dora-life", "FDSTORE": "4096"}, False),
+        ((), {"LISTEN_FDNAMES": "dora-life"}, False),
+    ],
+)
+def test_an_old_systemd_sends_no_notice_of_a_life_that_is_restarted(
+    tmp_path: Path, words: tuple[str, ...], environment: dict[str, str], is_requested: bool
+) -> None:
+    """The next life requests it."""
+    directory = tmp_path / "dora-systemd-notice/robot"
+    directory.mkdir(parents=True)
+    given = {"RUNTIME_DIRECTORY": f"/run/dora-systemd/robot:{directory}", **environment}
+    report_last_life(options(on_failure=words), given)
+    assert list(directory.iterdir()) == [directory / "request"] * is_requested
 
 
 def test_the_store_does_not_fill(unit: Unit) -> None:
