@@ -108,6 +108,25 @@ def test_uv_in_a_workspace(cell: Cell, project: Project) -> None:
     assert f"prefix {project.root}/.venv" in done.stdout
 
 
+@pytest.mark.warns("before initializing")
+def test_a_project_that_uv_builds(cell: Cell, project: Project) -> None:
+    """`doractl build --uv` of root makes the .venv of a project with a lock, as its owner."""
+    project.write("one.py", "import robot_parts\nprint('arms', robot_parts.ARMS)\n")
+    project.write("parts/robot_parts.py", "ARMS = 2\n")
+    project.write("pyproject.toml", '[project]\nname = "robot"\nversion = "1"\n')
+    flow = project.write("dataflow.yml", "nodes: [{id: one, path: one.py}]\n")
+    run("chown", "-R", "alice:alice", str(project.root))
+    uv = ("env", "HOME=/home/alice", "UV_OFFLINE=1", "uv", "lock", f"--project={project.root}")
+    run("setpriv", "--reuid=alice", "--regid=alice", "--init-groups", *uv)
+    cell.doractl("build", str(flow), "--uv", "--env", "UV_OFFLINE=1")
+    venv = project.root / ".venv"
+    assert venv.owner() == "alice"
+    (library,) = venv.glob("lib/python3*/site-packages")
+    (library / "parts.pth").write_text(str(project.root / "parts"))
+    done = cell.doractl("run", str(flow), "--name", cell.name, "--uv", "--env", "UV_OFFLINE=1")
+    assert "arms 2" in done.stdout
+
+
 def test_module(cell: Cell, project: Project) -> None:
     project.write("speaker.py", SPEAKER)
     project.write(
