@@ -129,7 +129,10 @@ def test_units() -> None:
         kind = flags.removeprefix("--")
         for unit in ("dora.slice", "dora.target"):
             words = sh(f"{show} {unit}", user).stdout.split()
-            assert sorted(words) == [f"/usr/lib/systemd/{kind}/{unit}", "loaded"]
+            assert "loaded" in words
+            # That of systemd 252 begins with the link /lib.
+            path = next(Path(one).resolve() for one in words if one.startswith("/"))
+            assert path == Path(f"/usr/lib/systemd/{kind}/{unit}")
     sh("systemd-analyze verify --man=yes dora.slice dora.target")
     sh(f"{ALICE} systemd-analyze verify --user --man=yes dora.slice dora.target", "alice")
     assert "dora.target" in sh("systemctl list-dependencies --plain multi-user.target").stdout

@@ -173,7 +173,7 @@ def packages_step() -> Step:
 def plan_platform(_form: str, suite: str) -> list[Step]:
     """Another release of Debian, where apt installs the packages, and uv wheels."""
     built = [build_step(), wheels_step()]
-    step = platform_step(suite, minutes=2)
+    step = platform_step(suite, "tests/deb/test_deb.py", minutes=4)
     return [*built, replace(step, after=tuple(one.name for one in built))]
 
 
