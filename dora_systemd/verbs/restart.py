@@ -11,7 +11,7 @@ from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer, Stage
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.runner_socket.client import ask_refusal
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.locks import uninhibited
@@ -61,8 +61,24 @@ def find_refusals(
     A runner that does not answer is no reason to leave its dataflow as it is.
     """
     running = [cell for cell in cells if cell.has_begun]
-    asked = [(cell, beside(partial(_find_refusal, scope, cell, ask))) for cell in running]
-    return {cell: error for cell, answer in asked if (error := answer.result())}
+    others = {cell: _other_version(cell) for cell in running if _is_of_other_version(cell)}
+    asked = [
+        (cell, beside(partial(_find_refusal, scope, cell, ask)))
+        for cell in running
+        if cell not in others
+    ]
+    return others | {cell: error for cell, answer in asked if (error := answer.result())}
+
+
+def _is_of_other_version(cell: Cell) -> bool:
+    """Whether its runner has options that the installed one would refuse; itself accepts them."""
+    return cell.has_options and bool(cell.options_problem)
+
+
+def _other_version(cell: Cell) -> DoraSystemdError:
+    message = f"cannot restart {cell.name}: another version of dora-systemd has started it"
+    hint = f"{cell.name} keeps running; doractl stop {cell.name}, then doractl start "
+    return DoraSystemdError(message, f"{hint}{cell.options.dataflow}", ExitCode.BAD_INPUT)
 
 
 def require_startable(scope: Scope, cell: Cell, ask: Ask = ask_refusal) -> None:

@@ -63,6 +63,18 @@ def test_the_node_that_failed_has_its_logs_named(manager: FakeManager) -> None:
     assert outcome.hint == f"check logs: doractl --user logs robot --node camera; {more}"
 
 
+def test_a_dataflow_of_another_version_keeps_running(manager: FakeManager) -> None:
+    """Its own runner would accept the restart, and the installed one refuses the command line."""
+    manager.units[UNIT]["ExecStart"][0][1].insert(-1, "--colour=red")
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
+    assert outcome.code is ExitCode.BAD_INPUT
+    assert outcome.problem.endswith("robot: another version of dora-systemd has started it")
+    assert outcome.hint.endswith("doractl stop robot, then doractl start /srv/robot.yml")
+    assert not any(call[0] == "RestartUnit" and len(call) > 1 for call in manager.calls)
+    (forced,) = restart_cells(manager, SCOPE, read_cells(manager), BY, True, ask=accept)
+    assert forced.text == f"Dataflow restarted: {UUID} (robot)"
+
+
 def test_restart_that_the_runner_refuses(manager: FakeManager) -> None:
     """As a start: the hint is no part of the sentence."""
     said = format_refusal(REFUSAL)
