@@ -176,6 +176,10 @@ def _enabled(path: Path, scope: Scope) -> Iterator[Finding]:
     elif not exists(options.dataflow):
         text = f"{options.name} is enabled, but {options.dataflow} does not exist"
         yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
+    elif runner_of(text, can_start=True) is None:
+        found = f"{options.name} cannot start at boot: another version has enabled it"
+        remedy = f"doractl disable {options.name}, then doractl start --enable {options.dataflow}"
+        yield Finding("boot", State.WARNING, found, remedy)
 
 
 def _leftovers(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:

@@ -77,8 +77,8 @@ def _is_of_other_version(cell: Cell) -> bool:
 
 def _other_version(cell: Cell) -> DoraSystemdError:
     message = f"cannot restart {cell.name}: another version of dora-systemd has started it"
-    hint = f"{cell.name} keeps running; doractl stop {cell.name}, then doractl start "
-    return DoraSystemdError(message, f"{hint}{cell.options.dataflow}", ExitCode.BAD_INPUT)
+    hint = f"{cell.name} keeps running; doractl list {cell.name} says how to start this version"
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 
 
 def require_startable(scope: Scope, cell: Cell, ask: Ask = ask_refusal) -> None:

@@ -8,7 +8,11 @@ import posixpath
 import re
 from collections.abc import Mapping, Sequence
 
-from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
+from dora_systemd.decisions.cell.options import (
+    RunnerOptions,
+    known_options_from_command,
+    options_from_command,
+)
 from dora_systemd.decisions.properties.assignments import (
     format_property,
     parse_line,
@@ -104,15 +108,19 @@ def is_boot_checked(text: str) -> bool:
     return f"RequiredBy={BOOT_CHECK}" in _logical_lines(text)
 
 
-def runner_of(text: str) -> RunnerOptions | None:
-    """The runner's options in the unit file `text`; None if it is not one of ours."""
+def runner_of(text: str, can_start: bool = False) -> RunnerOptions | None:
+    """The runner's options in the unit file `text`; None if it is not one of ours.
+
+    can_start: None also for a file with options that this version does not know.
+    """
     lines = _sections([text]).get("Service", ())
     commands = [line.partition("=")[2] for line in lines if re.match(r"ExecStart\s*=\s*\S", line)]
     if len(commands) != 1:
         return None
     try:
         ((_, argv, _),) = parse_line("ExecStart", commands[0])["ExecStart"].value
-        return options_from_command([word.replace("%%", "%") for word in argv])
+        command = [word.replace("%%", "%") for word in argv]
+        return (options_from_command if can_start else known_options_from_command)(command)
     except (DoraSystemdError, ValueError):
         return None
 

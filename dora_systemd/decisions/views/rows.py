@@ -70,7 +70,9 @@ class DataflowRow(NamedTuple):
         """Which other version of dora-systemd runs it, and what to do; "" if none does."""
         if self.options_problem:
             # A restart would start the same command line, which the installed runner refuses.
-            todo = f"doractl stop {self.name}, then doractl start {self.dataflow}"
+            flag = "--enable " if self.enabled else ""
+            todo = f"doractl stop {self.name}, then doractl start {flag}{self.dataflow}"
+            todo = "deploy its project again" if self.release else todo
             return f"another version has started it: {self.options_problem}", todo
         if self.runner_version in ("", __version__):
             return "", ""

@@ -67,7 +67,7 @@ def roll_back(
             return _end_first(manager, store, standing, by, tell)
         chosen = _choose(store, standing, release)
         text = store.unit(chosen)
-        options, manifest = runner_of(text), store.manifest(chosen)
+        options, manifest = runner_of(text, can_start=True), store.manifest(chosen)
         if options is None or options.name != store.name:
             hint = f"doractl releases {store.name} lists the others"
             message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"

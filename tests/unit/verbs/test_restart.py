@@ -69,7 +69,7 @@ def test_a_dataflow_of_another_version_keeps_running(manager: FakeManager) -> No
     (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
     assert outcome.code is ExitCode.BAD_INPUT
     assert outcome.problem.endswith("robot: another version of dora-systemd has started it")
-    assert outcome.hint.endswith("doractl stop robot, then doractl start /srv/robot.yml")
+    assert outcome.hint.endswith("doractl list robot says how to start this version")
     assert not any(call[0] == "RestartUnit" and len(call) > 1 for call in manager.calls)
     (forced,) = restart_cells(manager, SCOPE, read_cells(manager), BY, True, ask=accept)
     assert forced.text == f"Dataflow restarted: {UUID} (robot)"

@@ -38,7 +38,9 @@ def test_the_runner_is_found_again(dataflow: str, directory: str, value: str) ->
     """Whatever is in a path: the file's own command line says what the runner was told."""
     runner = options(dataflow=f"/{dataflow}", working_directory=f"/{directory}")
     text = persistent(runner, A=value)
-    assert runner_of(text) == runner
+    assert runner_of(text) == runner_of(text, can_start=True) == runner
+    other = text.replace(" --name=", " --colour=red --name=", 1)
+    assert (runner_of(other), runner_of(other, can_start=True)) == (runner, None)
     assert says_the_same(text, persistent(runner, A=value, target="multi-user.target"))
     assert not says_the_same(text, persistent(runner, A=f"{value}x"))
 
