@@ -113,7 +113,7 @@ def test_a_plan_shows_all_units() -> None:
     assert "--placed=doubler=gpu" in head
     assert "memory" not in head
     assert link.startswith("# machine gpu: b\n")
-    for word in ("member", "--placed=doubler=gpu", "--env=A=1", "--node-limit=doubler:memory=1G"):
+    for word in ("member", "--placed=doubler=gpu", "--env=A=1", "--set=doubler:memory_limit=1G"):
         assert word in link
     assert not there("b", "systemctl", "-q", "list-units", "dora-other*").stdout.strip()
 

@@ -128,7 +128,7 @@ ARGUMENTS = f"""\
 
 
 def test_unit_files_on_machines_have_these_arguments() -> None:
-    """Whatever is changed here, units of older versions must go on working."""
+    """After a release, those of enabled dataflows must go on working."""
     assert format_runner_argv(ALL) == shlex.split(ARGUMENTS)
     assert parse_runner_argv(shlex.split(ARGUMENTS)) == ALL
     short = ["--dora=/usr/bin/dora", f"--uuid={UUID}", "--name=robot", "--working-directory=/srv"]
