@@ -94,6 +94,20 @@ def test_rights_of_one_node_and_of_the_others(cell: Cell, project: Project) -> N
     assert of_node(cell, "sink") == expected["sink"]
 
 
+def test_a_node_without_core_dumps(cell: Cell, project: Project) -> None:
+    """Its limit is 0, that of the others as in the unit, also after a restart."""
+    flow = project.three_nodes()
+    project.write("dataflow.systemd.yml", "nodes: {sink: {core_dumps: no}}\n")
+    cell.start(flow)
+    cell.wait_exchanging()
+    others = hard_limit(cell.supervisor_pid("daemon"), "Max core file size")
+    assert others != "0"
+    limits = {
+        node: hard_limit(one.pid, "Max core file size") for node, one in cell.status.nodes.items()
+    }
+    assert limits == {"sink": "0", "source": others, "doubler": others}
+
+
 RAISING = ("scheduling=fifo:5", "scheduling=rr:7", "nice=-5", "oom-score-adjust=-50", "lock-memory")
 
 

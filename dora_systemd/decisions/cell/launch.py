@@ -5,7 +5,7 @@ as the daemon would. Nodes that dora must start itself stay unchanged.
 """
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
@@ -123,7 +123,14 @@ def launcher_words(node: Node, source: str, plan: LaunchPlan) -> list[str]:
     """launcher.pl and its arguments for a node. Raises DoraSystemdError if it cannot run."""
     output = ("keep" if node.keeps_output else "pipe") + _notify_words(node, plan)
     directory = _directory(node, source, plan)
-    return [plan.launcher, node.id, directory, output, *_command(node, directory, source, plan)]
+    command = [*_without_core_dump(node.id, plan.options), *_command(node, directory, source, plan)]
+    return [plan.launcher, node.id, directory, output, *command]
+
+
+def _without_core_dump(node: str, options: RunnerOptions) -> Sequence[str]:
+    """The program that keeps the kernel from writing the memory of the node, see prlimit(1)."""
+    keeps = options.by_node("core_dumps").get(node, True)
+    return () if keeps else ("/usr/bin/prlimit", "--core=0:0")
 
 
 def _notify_words(node: Node, plan: LaunchPlan) -> str:

@@ -40,6 +40,7 @@ _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 
 MODULES = {
+    "core_dumps": "rights",
     "cpu_limit": "limits",
     "cpu_weight": "limits",
     "cpus": "limits",
@@ -155,12 +156,7 @@ def changed(
 
 
 def runner_setting(key: str) -> Any:
-    """The Setting, whose module is imported with its first value, because few dataflows have one.
-
-    Raises DoraSystemdError (USAGE) for a key that no runner has.
-    """
-    if key not in MODULES:
-        raise _refusal(f"unknown setting {quoted(key)}")
+    """The Setting; its module is imported with the first value, because few dataflows have one."""
     module = import_module(f"dora_systemd.decisions.settings.{MODULES[key]}")
     return module.RUNNER_SETTINGS[key]
 
@@ -226,6 +222,8 @@ def parse_setting(text: str) -> SettingText:
     node, _, key = place.rpartition(":")
     if not equals or not key.isidentifier():
         raise _refusal(f"{quoted(text)} is not [NODE:]KEY=TEXT")
+    if key not in MODULES:  # of a runner that another version has started
+        raise _refusal(f"unknown setting {quoted(key)}")
     return SettingText(node, key, value)
 
 

@@ -187,9 +187,18 @@ def check_rights_nodes(rights: Iterable[NodeRights], launched: Container[str]) -
 
     launched: nodes that our launcher starts, which sets their rights.
     """
-    for one in rights:
-        if one.node not in launched and given_rights(one).keys() - {"essential"}:
-            message = f"cannot give rights to the node {quoted(one.node)}: something else starts it"
+    more = (one.node for one in rights if given_rights(one).keys() - {"essential"})
+    check_launched("cannot give rights to", more, launched)
+
+
+def check_launched(problem: str, nodes: Iterable[str], launched: Container[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for the first of `nodes` that something else starts.
+
+    problem: the text before "the node", as in names.check_known().
+    """
+    for node in nodes:
+        if node not in launched:
+            message = f"{problem} the node {quoted(node)}: something else starts it"
             hint = "what starts a dynamic or ROS 2 node gives it its rights"
             raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 

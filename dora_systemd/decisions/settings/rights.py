@@ -9,6 +9,7 @@ from dora_systemd.decisions.cell.rights import (
     BY_KEY,
     RIGHTS,
     NodeRights,
+    check_launched,
     check_rights_nodes,
     format_node_rights,
     given_rights,
@@ -24,6 +25,11 @@ from dora_systemd.decisions.settings.kinds import BOOL, Kind, Setting, one_text,
 def check_rights(options: RunnerOptions, nodes: Sequence[Node]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for rights of a node that cannot have them."""
     check_rights_nodes(rights_of(options), {node.id for node in nodes if has_launcher(node)})
+
+
+def _check_core_dumps(options: RunnerOptions, nodes: Sequence[Node]) -> None:
+    launched = {node.id for node in nodes if has_launcher(node)}
+    check_launched("cannot set core_dumps of", options.by_node("core_dumps"), launched)
 
 
 def _of_node(
@@ -76,7 +82,15 @@ ESSENTIAL: Setting[bool] = _of_node(
     False,
     on_head=True,
 )
+CORE_DUMPS = Setting[bool](
+    "core_dumps",
+    BOOL,
+    True,
+    "Keep the core dumps of the node, see core(5); the node restarts when its dump is written.",
+    only_nodes=True,
+    check=_check_core_dumps,
+)
 RIGHTS_SETTINGS: tuple[Setting[Any], ...] = (
-    *(NODE_RIGHTS, SCHEDULING, LOCK_MEMORY, OOM_SCORE_ADJUST, ESSENTIAL),
+    *(NODE_RIGHTS, SCHEDULING, LOCK_MEMORY, OOM_SCORE_ADJUST, ESSENTIAL, CORE_DUMPS),
 )
 RUNNER_SETTINGS = {one.name: one for one in RIGHTS_SETTINGS[1:]}

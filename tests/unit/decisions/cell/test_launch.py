@@ -15,7 +15,7 @@ from dora_systemd.decisions.cell.launch import (
     launch_descriptor,
     python_of,
 )
-from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
     parse_dataflow,
@@ -63,6 +63,15 @@ def words(node: dict[str, Any], given: LaunchPlan | None = None) -> list[str]:
     launched = launch(node, given)
     assert launched["path"] == "/usr/bin/perl"
     return shlex.split(launched["args"])
+
+
+@pytest.mark.parametrize(
+    ("text", "prefix"), [("no", ["/usr/bin/prlimit", "--core=0:0"]), ("yes", [])]
+)
+def test_a_node_without_core_dumps(text: str, prefix: list[str]) -> None:
+    given = plan(settings=(SettingText("n", "core_dumps", text),))
+    assert words({"path": "a.py"}, given)[4:] == [*prefix, "/usr/bin/python3", "-u", "/p/a.py"]
+    assert words({"path": "a.py"})[4:] == ["/usr/bin/python3", "-u", "/p/a.py"]
 
 
 @pytest.mark.parametrize(

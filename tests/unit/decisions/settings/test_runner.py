@@ -77,9 +77,16 @@ def test_what_is_no_setting(text: str) -> None:
         parse_setting(text)
 
 
-@pytest.mark.parametrize("words", [["stop=soon"], ["stp=1s"], ["camera:stop=within=soon"]])
-def test_the_runner_refuses_what_it_does_not_know(words: list[str]) -> None:
-    options = OPTIONS._replace(settings=tuple(map(parse_setting, words)))
+@pytest.mark.parametrize("text", ["stp=1s", "camera:stp=1s"])
+def test_a_setting_of_another_version(text: str) -> None:
+    """`list` then leaves it out, and names the problem."""
+    with pytest.raises(DoraSystemdError, match="unknown setting 'stp'"):
+        parse_setting(text)
+
+
+@pytest.mark.parametrize("text", ["stop=soon", "camera:stop=within=soon"])
+def test_the_runner_refuses_a_text_that_is_no_value(text: str) -> None:
+    options = OPTIONS._replace(settings=(parse_setting(text),))
     with pytest.raises(DoraSystemdError):
         check_settings(options, NODES)
 
@@ -161,3 +168,13 @@ def test_values_of_a_flag_that_names_nodes_are_those_of_the_nodes() -> None:
     ], "the nice value for all is a property of the unit"
     assert [one.place for one in owes_of(options)] == ["camera/d", "camera/image"]
     assert rights_of(options)[0] == NodeRights("camera", nice=5, essential=True)
+
+
+def test_core_dumps_of_a_node() -> None:
+    options = started({"nodes": {"camera": {"core_dumps": False}}})
+    assert options.by_node("core_dumps") == {"camera": False}
+    check_settings(options, NODES)
+    dynamic = parse_node({"id": "camera", "path": "dynamic"}, 0, "robot.yml")
+    reason = "cannot set core_dumps of the node 'camera': something else starts it"
+    with pytest.raises(DoraSystemdError, match=reason):
+        check_settings(options, [dynamic])
