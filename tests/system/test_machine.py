@@ -183,7 +183,7 @@ def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> 
     assert held(cell) == changed
     text = cell.doractl("show", cell.name).stdout
     assert "MemoryMax=1572864000" in text
-    assert "sink:cpu=80%%,memory=600M" in text
+    assert "sink:cpu_limit=80%% sink:memory_limit=600M" in text
     bad = cell.doractl("set", cell.unit, "--memory-limit=2G", "--node-limit=x:cpu=1", check=False)
     assert bad.returncode == ExitCode.BAD_INPUT
     assert held(cell) == changed
