@@ -163,7 +163,7 @@ def test_limits_are_what_the_kernel_holds_up(cell: Cell, project: Project) -> No
     assert {name: control(cell, "node-sink", name) for name in files} == files
     assert control(cell, "node-source", "memory.max") == str(1 << 30)
     assert control(cell, "node-doubler", "memory.max") == "max"
-    assert "--node-limit=sink:cpu=150%%,memory=300M," in cell.doractl("show", cell.name).stdout
+    assert "--set=sink:cpu_limit=150%%" in cell.doractl("show", cell.name).stdout
     row = listed(cell)
     assert (row["memory_limit_bytes"], row["cpu_limit_percent"]) == (1500 << 20, 150)
     assert [one["memory_limit_bytes"] for one in row["nodes"]] == [1 << 30, None, 300 << 20]
