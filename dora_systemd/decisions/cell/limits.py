@@ -5,9 +5,8 @@ The control files are those of the kernel's "Control Group v2" document.
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import check_known
 from dora_systemd.values import (
@@ -23,6 +22,9 @@ from dora_systemd.values import (
     parse_size,
     quoted,
 )
+
+if TYPE_CHECKING:  # `list` loads this module, and needs no options
+    from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
 
 SMALLEST_MEMORY = 1024 * 1024
 """Bytes. A smaller value is a missing suffix: no program runs in so little memory."""
@@ -181,7 +183,7 @@ def merge_node_limits(*sources: Iterable[NodeLimits]) -> tuple[NodeLimits, ...]:
     return tuple(node_limits(node, limits) for node, limits in merged.items() if limits)
 
 
-def limits_of(options: RunnerOptions) -> tuple[NodeLimits, ...]:
+def limits_of(options: "RunnerOptions") -> tuple[NodeLimits, ...]:
     """The limits of single nodes. Raises DoraSystemdError."""
     named = dict.fromkeys(one.node for one in options.settings if one.node and one.key in BY_KEY)
     found = {one.word: options.by_node(one.key) for one in LIMITS} if named else {}
@@ -191,8 +193,10 @@ def limits_of(options: RunnerOptions) -> tuple[NodeLimits, ...]:
     )
 
 
-def limit_texts(limits: Iterable[NodeLimits]) -> list[SettingText]:
+def limit_texts(limits: Iterable[NodeLimits]) -> "list[SettingText]":
     """The limits as settings of the runner."""
+    from dora_systemd.decisions.cell.options import SettingText
+
     return [
         SettingText(one.node, BY_WORD[word].key, BY_WORD[word].format(value))
         for one in limits
