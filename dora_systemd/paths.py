@@ -17,9 +17,10 @@ def own_directory(environment: Mapping[str, str]) -> str:
     return next((one for one in _directories(environment) if not _is_of_notices(one)), "")
 
 
-def request_directory(environment: Mapping[str, str]) -> str:
-    """The directory in which a runner requests a notice, "" if its dataflow has no on_failure."""
-    return next(filter(_is_of_notices, _directories(environment)), "")
+def request_file(environment: Mapping[str, str]) -> Path | None:
+    """The file by which a runner requests a notice, None if its dataflow has no on_failure."""
+    directory = next(filter(_is_of_notices, _directories(environment)), None)
+    return Path(directory, "request") if directory else None
 
 
 def _directories(environment: Mapping[str, str]) -> list[str]:

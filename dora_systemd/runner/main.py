@@ -38,7 +38,7 @@ from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
-from dora_systemd.paths import CellPaths, own_directory, request_directory
+from dora_systemd.paths import CellPaths, own_directory, request_file
 from dora_systemd.runner.cell.begin import (
     daemon_variables,
     enter_supervisor,
@@ -255,11 +255,11 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             pump.on_node = NodeStops(pump, dora, runs.nodes, dialogue).perform
         variables = daemon_variables(own, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
-        if options.on_failure and (requests := request_directory(os.environ)):
+        if options.on_failure and (file := request_file(os.environ)):
             # Imported late: few dataflows have it.
             from dora_systemd.runner.cell.notices import notice_watch
 
-            pump.on_change = notice_watch(requests, runs.pipes)
+            pump.on_change = notice_watch(file, runs.pipes)
         runs.pipes.mute()
         listen(runs, pump, dialogue)
         if coordinator is not None:

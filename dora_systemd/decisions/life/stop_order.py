@@ -23,8 +23,8 @@ from dora_systemd.decisions.life.states import (
     StopStep,
 )
 
-_GONE = ("failed", "finished", "restarting", "dynamic")
-"""States in which no process of the node is waited for."""
+_NOT_AWAITED = ("restarting", "dynamic")
+"""States in which the stop waits for no process, although the node has not ended."""
 
 
 def has_order(cell: Cell) -> bool:
@@ -60,7 +60,7 @@ def _has_ended(cell: Cell, node: str) -> bool:
     status = cell.nodes.get(node)
     if status is None or cell.ending.get(node) is StopStep.KILLED:
         return True
-    return _is_over(status) or status.state in _GONE
+    return _is_over(status) or status.state in _NOT_AWAITED
 
 
 def overdue(cell: Cell, event: life.NodeOverdue) -> Next:

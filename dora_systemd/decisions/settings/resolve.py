@@ -10,7 +10,6 @@ from pathlib import PurePath
 from typing import Any, TypeVar, cast
 
 from dora_systemd.decisions.cell.hot_reload import HotReload
-from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_limits, node_limits
 from dora_systemd.decisions.cell.needs import split_needs
 from dora_systemd.decisions.cell.options import (
     MODULES,
@@ -24,7 +23,6 @@ from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_va
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
-from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.on_failure import ON_FAILURE
 from dora_systemd.decisions.settings.owes import NOTIFY, OWES, WATCHDOG, merged_owes
@@ -281,16 +279,6 @@ def watchdogs(settings: Settings) -> Watchdogs:
     timed = {node: True for node, one in settings.by_node(STOP).items() if one and one.within}
     sockets = {ALL_NODES: settings[NOTIFY], **timed, **settings.by_node(NOTIFY)}
     return merge_watchdogs(settings.by_node(WATCHDOG), settings[WATCHDOG], sockets)
-
-
-def settings_node_limits(settings: Settings) -> tuple[NodeLimits, ...]:
-    """The limits of all nodes: those of settings files, overridden by `node_limit`."""
-    given = settings[NODE_LIMIT]
-    of_files = (
-        node_limits(node, {BY_KEY[key].word: values[key] for key in values.keys() & BY_KEY})
-        for node, values in settings.nodes.items()
-    )
-    return merge_node_limits(of_files, given)
 
 
 def restart_policy(settings: Settings) -> RestartPolicy:

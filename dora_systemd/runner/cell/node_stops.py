@@ -7,7 +7,6 @@ any more when the node extends its time. So dora gets a duration that never ends
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable
 from signal import SIGTERM
 
@@ -20,13 +19,10 @@ from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.runner.nodes.watchdog import monotonic_us
 from dora_systemd.values import SECOND
 
 MonotonicUs = Callable[[], int]
-
-
-def _monotonic_us() -> int:
-    return time.monotonic_ns() // 1000
 
 
 class NodeStops:
@@ -38,7 +34,7 @@ class NodeStops:
         dora: Engine,
         nodes: Nodes,
         tasks: Tasks,
-        clock_us: MonotonicUs = _monotonic_us,
+        clock_us: MonotonicUs = monotonic_us,
     ) -> None:
         self._pump, self._engine, self._nodes, self._tasks = pump, dora, nodes, tasks
         self._clock_us = clock_us

@@ -13,10 +13,8 @@ from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.logs.journal_events import GIVEN_UP
 from dora_systemd.runner.cell.failure import say
 
-FILE = "request"
 
-
-def notice_watch(directory: str, pipes: LogPipes) -> Callable[[life.Event, Cell, Cell], None]:
+def notice_watch(file: Path, pipes: LogPipes) -> Callable[[life.Event, Cell, Cell], None]:
     """Return what the pump calls after each event, with the cells before and after it."""
 
     def look(event: life.Event, before: Cell, after: Cell) -> None:
@@ -25,14 +23,14 @@ def notice_watch(directory: str, pipes: LogPipes) -> Callable[[life.Event, Cell,
             pipes.write_event(GIVEN_UP, node, reason=reason)
         is_lost = isinstance(event, life.MachineLost) and not event.by and after is not before
         if nodes or is_lost:
-            request(Path(directory))
+            request(file)
 
     return look
 
 
-def request(directory: Path) -> None:
+def request(file: Path) -> None:
     """Request a notice, after the event that it reports was sent to the journal."""
     try:
-        (directory / FILE).touch(0o600)
+        file.touch(0o600)
     except OSError as error:
         say(f"<4>cannot request a notice: {error}")

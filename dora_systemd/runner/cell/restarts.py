@@ -25,7 +25,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import HEAD_START, RestartPolicy, count_restarts
 from dora_systemd.errors import DoraSystemdError, RestartsSpent
 from dora_systemd.names import unit_name
-from dora_systemd.paths import CellPaths, request_directory
+from dora_systemd.paths import CellPaths, request_file
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
 _ASK_SECONDS = 5.0
@@ -58,10 +58,10 @@ def report_last_life(options: RunnerOptions, environment: Mapping[str, str]) -> 
     systemd 254 starts the units of OnFailure= at each failure, and sets $FDSTORE; earlier versions
     start them only if no restart follows. The earlier life has left descriptors, see fd_store.
     """
-    directory = request_directory(environment) if options.on_failure else ""
-    if directory and "FDSTORE" not in environment and environment.get("LISTEN_FDNAMES"):
+    file = request_file(environment) if options.on_failure else None
+    if file and "FDSTORE" not in environment and environment.get("LISTEN_FDNAMES"):
         with contextlib.suppress(OSError):
-            Path(directory, "request").touch(0o600)
+            file.touch(0o600)
 
 
 def find_spent(options: RunnerOptions, paths: CellPaths) -> RestartsSpent | None:

@@ -49,7 +49,8 @@ IsBlocked = Callable[[str], bool]
 """Whether a node may have to wait for the journal."""
 
 
-def _monotonic_us() -> int:
+def monotonic_us() -> int:
+    """Read CLOCK_MONOTONIC in µs."""
     return time.monotonic_ns() // 1000
 
 
@@ -91,7 +92,7 @@ class NotifySockets:
         paths: CellPaths,
         tell: Callable[..., None],
         is_in: Callable[[Path, int], bool] = is_member,
-        clock_us: Callable[[], int] = _monotonic_us,
+        clock_us: Callable[[], int] = monotonic_us,
     ) -> None:
         self._watchdogs = watchdogs
         self._unit = unit

@@ -66,8 +66,8 @@ class Dispatcher:
         """Send a notice of what has happened, and again as long as something has happened since.
 
         systemd drops the start of a service that runs. So the service reports its end first, by
-        STOPPING=1: a start that comes later waits until this process has ended. A failure from
-        before that is in the journal, which is then read once more.
+        STOPPING=1: a start that comes later waits until this process has ended. Then the service
+        reads the journal one last time, which has each failure from before STOPPING=1.
         """
         self._sleep(SETTLE_SECONDS)
         while self._work():

@@ -1,4 +1,4 @@
-"""A stop with an order: who is told when, who gets a signal, and who gets more time."""
+"""A stop with an order: when each node receives its stop, a signal, or more time."""
 
 from dataclasses import replace
 
