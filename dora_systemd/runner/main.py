@@ -24,7 +24,7 @@ from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import serve
 from dora_systemd.decisions.cell.environment import with_changes
-from dora_systemd.decisions.cell.launch import kinds
+from dora_systemd.decisions.cell.launch import kinds, watchdogs_of
 from dora_systemd.decisions.cell.limits import limits_of
 from dora_systemd.decisions.cell.line_rates import rates_of
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
@@ -149,7 +149,7 @@ class Runs:
         self.environment = nodes_environment(options.working_directory)
         settings = SettingsFile(settings_path(options.dataflow), paths.settings)
         self.reloader = Reloader(options, self.environment, settings, given)
-        self.nodes = Nodes(self.unit, paths, pipes, self.role.own(options).watchdogs)
+        self.nodes = Nodes(self.unit, paths, pipes, watchdogs_of(self.role.own(options)))
         self.beside = Beside(asyncio.get_running_loop())
         self.check = begun[1] if begun else DoraCheck(options, self.environment)
 

@@ -25,7 +25,6 @@ from dora_systemd.decisions.descriptor.dataflow import (
     session_path,
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
-from dora_systemd.decisions.watchdog.watchdogs import check_watchdogs
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight
@@ -78,8 +77,6 @@ def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
     _check_limited(options, dataflow)
     ids = [node.id for node in dataflow.nodes]
     check_reload_nodes(options.reload, ids)
-    launched = [node.id for node in dataflow.nodes if is_launched(node)]
-    check_watchdogs(options.watchdogs, ids, launched)
     check_needs(options.needs, {node.id: is_launched(node) for node in dataflow.nodes})
 
 

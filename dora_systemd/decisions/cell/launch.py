@@ -7,6 +7,7 @@ as the daemon would. Nodes that dora must start itself stay unchanged.
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import PurePath
 from typing import Any
 
@@ -25,7 +26,13 @@ from dora_systemd.decisions.descriptor.nodes import (
     operator_file,
     split_arguments,
 )
-from dora_systemd.decisions.watchdog.watchdogs import watchdog_of
+from dora_systemd.decisions.watchdog.watchdogs import (
+    ALL_NODES,
+    OFF,
+    Watchdogs,
+    merge_watchdogs,
+    watchdog_of,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, as_mapping, quoted, shown
 
@@ -138,11 +145,26 @@ def _notify_words(node: Node, plan: LaunchPlan) -> str:
 
     The program of a node whose process is uv or a shell has another pid: ":any" is no WATCHDOG_PID.
     """
-    limit = watchdog_of(plan.options.watchdogs, node.id)
+    limit = watchdog_of(watchdogs_of(plan.options), node.id)
     if not limit:
         return ""
     is_wrapped = plan.options.uv or node.kind is NodeKind.SHELL
     return f":{limit if limit < INFINITY else 0}" + (":any" if is_wrapped else "")
+
+
+@lru_cache(maxsize=4)
+def watchdogs_of(options: RunnerOptions) -> Watchdogs:
+    """Which nodes have one: none of those of other machines. Raises DoraSystemdError."""
+    if not any(map(options.has, ("watchdog", "notify", "stop"))):
+        return {}
+    limits = dict(options.of_dataflow("watchdog"))
+    limits |= {node: own[ALL_NODES] for node, own in options.by_node("watchdog").items()}
+    # A node with a time to stop can extend it.
+    timed = {node: True for node, one in options.by_node("stop").items() if one.within}
+    sockets = {ALL_NODES: options.of_dataflow("notify"), **timed, **options.by_node("notify")}
+    found = merge_watchdogs(limits, sockets)
+    away = [one.node for one in options.placed if one.machine != options.machine]
+    return {**found, **dict.fromkeys(away, OFF)} if ALL_NODES in found else found
 
 
 def _keys_of_kept(node: str, options: RunnerOptions) -> Mapping[str, Any]:

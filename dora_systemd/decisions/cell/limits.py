@@ -5,6 +5,7 @@ The control files are those of the kernel's "Control Group v2" document.
 
 import re
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -183,6 +184,7 @@ def merge_node_limits(*sources: Iterable[NodeLimits]) -> tuple[NodeLimits, ...]:
     return tuple(node_limits(node, limits) for node, limits in merged.items() if limits)
 
 
+@lru_cache(maxsize=4)
 def limits_of(options: "RunnerOptions") -> tuple[NodeLimits, ...]:
     """The limits of single nodes. Raises DoraSystemdError."""
     named = dict.fromkeys(one.node for one in options.settings if one.node and one.key in BY_KEY)

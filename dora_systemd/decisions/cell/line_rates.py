@@ -15,7 +15,7 @@ from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duratio
 SHORTEST = SECOND // 10
 """µs. A window with dropped lines ends with an event: at most ten per second."""
 
-_HINT = "write LINES/TIME such as 1000/1s, with at least one line and 100ms; or infinity"
+HINT = "write LINES/TIME such as 1000/1s, with at least one line and 100ms; or infinity"
 
 ALL_NODES = ""
 
@@ -91,25 +91,9 @@ def rate_of(limits: RateLimits, node: str) -> RateLimit | None:
     return limits[node] if node in limits else limits.get(ALL_NODES)
 
 
-def merge_rates(nodes: Mapping[str, RateLimits], given: RateLimits) -> RateLimits:
-    """The limits of `given`, which take precedence over those that a settings file has for nodes.
-
-    Raises DoraSystemdError (BAD_INPUT) for a limit in `nodes` that has the form NODE=LIMIT itself.
-    """
-    limits: dict[str, RateLimit | None] = {}
-    for node, own in nodes.items():
-        for name, limit in own.items():
-            if name:
-                text = f"{name}={format_rate(limit)}"
-                message = f"cannot use {quoted(text)} as log_rate_limit of node {node}"
-                raise DoraSystemdError(message, _HINT, ExitCode.BAD_INPUT)
-            limits[node] = limit
-    return {**limits, **given}
-
-
 def _refusal(text: str) -> DoraSystemdError:
     message = f"cannot read {quoted(text)} as a rate of lines"
-    return DoraSystemdError(message, _HINT, ExitCode.USAGE)
+    return DoraSystemdError(message, HINT, ExitCode.USAGE)
 
 
 def check_rates(limits: RateLimits, nodes: Sequence[str]) -> None:

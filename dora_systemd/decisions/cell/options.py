@@ -5,6 +5,7 @@ module imports only what loads quickly.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from importlib import import_module
 from operator import attrgetter
 from pathlib import PurePath
@@ -51,6 +52,7 @@ MODULES = {
     "memory_high": "limits",
     "memory_limit": "limits",
     "nice": "limits",
+    "notify": "owes",
     "oom_score_adjust": "rights",
     "owes": "owes",
     "scheduling": "rights",
@@ -58,6 +60,7 @@ MODULES = {
     "stop_limit": "stops",
     "swap_limit": "limits",
     "tasks_limit": "limits",
+    "watchdog": "owes",
 }
 """By key of each setting that a runner receives as text, its module in decisions/settings/."""
 
@@ -93,8 +96,6 @@ class RunnerOptions(NamedTuple):
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()  # policies of single nodes
     start_timeout: int = INFINITY  # µs for all nodes to become ready, or INFINITY
     reload: HotReload = DEFAULT_RELOAD  # files that cause a reload, and how nodes are replaced
-    # nodes with a notify socket, see dora_systemd.decisions.watchdog.watchdogs
-    watchdogs: Mapping[str, int] = {}
     needs: tuple[NodeNeed, ...] = ()  # paths and interfaces that single nodes wait for
     settings: tuple[SettingText, ...] = ()  # see dora_systemd.decisions.settings
     placed: tuple[Placed, ...] = ()  # the nodes that run on other machines than the head
@@ -126,14 +127,10 @@ class RunnerOptions(NamedTuple):
         texts = [one.text for one in self.settings if one[:2] == ("", key)]
         return setting.read(texts) if texts else setting.default
 
-    def by_node(self, key: str) -> dict[str, Any]:
+    def by_node(self, key: str) -> Mapping[str, Any]:
         """The values that single nodes have of the setting, by node."""
         assert key in MODULES
-        texts: dict[str, list[str]] = {}
-        for one in self.settings:
-            if one.node and one.key == key:
-                texts.setdefault(one.node, []).append(one.text)
-        return {node: runner_setting(key).read(own) for node, own in texts.items()}
+        return _by_node(self, key)
 
     def without(self, *keys: str) -> "RunnerOptions":
         """The options without values of these settings."""
@@ -144,6 +141,16 @@ class RunnerOptions(NamedTuple):
         """The value that a node has of the setting, or that of the dataflow."""
         own = self.by_node(key)
         return own[node] if node in own else self.of_dataflow(key)
+
+
+@lru_cache(maxsize=64)
+def _by_node(options: RunnerOptions, key: str) -> Mapping[str, Any]:
+    # Cached: with many nodes, each start of one reads the values of all.
+    texts: dict[str, list[str]] = {}
+    for one in options.settings:
+        if one.node and one.key == key:
+            texts.setdefault(one.node, []).append(one.text)
+    return {node: runner_setting(key).read(own) for node, own in texts.items()}
 
 
 def changed(
@@ -209,11 +216,6 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
 _parse_words, _format_words = (
     _late("notice.command", name) for name in ("parse_words", "format_words")
 )
-_parse_watchdogs = _late("watchdog.watchdogs", "parse_sockets")
-
-
-def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
-    return _late("watchdog.watchdogs", "format_watchdogs")(watchdogs) if watchdogs else []
 
 
 def parse_setting(text: str) -> SettingText:
@@ -245,7 +247,6 @@ _OPTIONS = (
     _unless_default("start-timeout", "start_timeout", parse_duration, format_duration),
     _each("env-key", "env_keys"),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
-    Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("needs", "needs", parse_node_need, "=".join),
     _each("set", "settings", parse_setting, format_setting),
     _each("placed", "placed", parse_placed, "=".join),

@@ -4,6 +4,7 @@ The setting is in decisions/settings/owes.py.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -106,6 +107,7 @@ def merge_owed(*given: Iterable[Owed]) -> tuple[Owed, ...]:
     return tuple({one.place: one for many in given for one in many}.values())
 
 
+@lru_cache(maxsize=4)
 def owes_of(options: RunnerOptions) -> tuple[Owed, ...]:
     """The outputs that nodes owe. Raises DoraSystemdError."""
     owes = options.by_node("owes")

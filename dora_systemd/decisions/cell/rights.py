@@ -10,7 +10,7 @@ again, to the value of the unit, which the kernel keeps for all children.
 import re
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import lru_cache, reduce
 from operator import or_
 from typing import Any, NamedTuple
 
@@ -157,6 +157,7 @@ def merge_node_rights(*sources: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
     return tuple(NodeRights(node, **reduce(or_, given)) for node, given in by_node.items())
 
 
+@lru_cache(maxsize=4)
 def rights_of(options: RunnerOptions) -> tuple[NodeRights, ...]:
     """The rights of single nodes. Raises DoraSystemdError."""
     named = dict.fromkeys(one.node for one in options.settings if one.node and one.key in BY_KEY)

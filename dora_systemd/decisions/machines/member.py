@@ -18,7 +18,6 @@ from dora_systemd.decisions.cell.options import (
 from dora_systemd.decisions.machines.entry import Machine
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.kinds import Setting
-from dora_systemd.decisions.settings.owes import NOTIFY, WATCHDOG
 from dora_systemd.decisions.settings.resolve import SET, Settings
 from dora_systemd.decisions.settings.sandbox import SANDBOX
 from dora_systemd.decisions.settings.table import (
@@ -28,9 +27,7 @@ from dora_systemd.decisions.settings.table import (
     UV,
     WORKING_DIRECTORY,
 )
-from dora_systemd.decisions.watchdog.watchdogs import ALL_NODES, OFF, Watchdogs, watchdog_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import INFINITY
 
 VERB = "member"
 _SHARED: tuple[Setting[Any], ...] = (UV, ALLOW_SHELL_NODES, GRACE_DURATION, SANDBOX)
@@ -58,18 +55,12 @@ def on_head(options: RunnerOptions) -> RunnerOptions:
     away = {one.node for one in options.placed}
     return options._replace(
         head="",
-        watchdogs=_without(options.watchdogs, away),
         settings=tuple(
             one
             for one in options.settings
             if one.node not in away or runner_setting(one.key).on_head
         ),
     )
-
-
-def _without(watchdogs: Watchdogs, away: set[str]) -> Watchdogs:
-    kept = {node: limit for node, limit in watchdogs.items() if node not in away}
-    return {**kept, **dict.fromkeys(away, OFF)} if ALL_NODES in kept else kept
 
 
 def member_of(
@@ -109,7 +100,6 @@ def _words(
     nodes = [one.node for one in options.placed if one.machine == machine.name]
     yield from (f"--{SET}={format_setting(one)}" for one in _passed_on(options.settings, nodes))
     given = [(one, settings[one]) for one in _SHARED if settings.is_given(one)]
-    given += _of_nodes(options, nodes)
     if settings[WORKING_DIRECTORY] is not None:
         given.append((WORKING_DIRECTORY, _directory(machine, options)))
     own = {one.name: (one, value) for one, value in machine.settings}
@@ -147,10 +137,3 @@ def _directory(machine: Machine, options: RunnerOptions) -> str:
     if machine.directory and there.is_relative_to(here):
         return str(PurePath(machine.directory, there.relative_to(here)))
     return str(there)
-
-
-def _of_nodes(options: RunnerOptions, nodes: Sequence[str]) -> Iterator[tuple[Setting[Any], Any]]:
-    limits = {node: watchdog_of(options.watchdogs, node) for node in nodes}
-    yield WATCHDOG, {node: limit for node, limit in limits.items() if OFF < limit < INFINITY}
-    if INFINITY in limits.values():
-        yield NOTIFY, True

@@ -31,7 +31,6 @@ def own_options(options: RunnerOptions) -> RunnerOptions:
         settings=tuple(
             one for one in options.settings if not one.node or is_here(options, one.node)
         ),
-        watchdogs={node: one for node, one in options.watchdogs.items() if is_here(options, node)},
     )
 
 

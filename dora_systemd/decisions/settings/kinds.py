@@ -162,6 +162,27 @@ def texts_of_nodes(
     )
 
 
+def by_named_node(
+    key: str, to_texts: Callable[[Mapping[str, T]], Sequence[str]], hint: str
+) -> Callable[[Mapping[str, Any], Any], dict[str, dict[str, Any]]]:
+    """A Setting.by_node for values that name their nodes, with "" for all nodes.
+
+    A value for the dataflow takes precedence over those that settings files have for nodes.
+    """
+
+    def by_node(
+        nodes: Mapping[str, Mapping[str, T]], given: Mapping[str, T]
+    ) -> dict[str, dict[str, Any]]:
+        for node, own in nodes.items():
+            if named := {one: value for one, value in own.items() if one}:
+                message = f"cannot use {quoted(to_texts(named)[0])} as {key} of node {node}"
+                raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        values = {**{node: own[""] for node, own in nodes.items()}, **given}
+        return {node: {key: {"": value}} for node, value in values.items()}
+
+    return by_node
+
+
 def _checked_text(text: str) -> str:
     if not text.strip() or not text.isprintable():
         hint = "write one line of plain text"

@@ -1,23 +1,9 @@
 """The setting `log_rate_limit`: how many lines of each node reach the journal."""
 
-from collections.abc import Mapping
 from operator import or_
 
-from dora_systemd.decisions.cell.line_rates import (
-    RateLimits,
-    format_rates,
-    merge_rates,
-    parse_rates,
-)
-from dora_systemd.decisions.settings.kinds import Setting, many_texts
-
-
-def _by_node(
-    nodes: Mapping[str, RateLimits], given: RateLimits
-) -> dict[str, dict[str, RateLimits]]:
-    merged = merge_rates(nodes, given)
-    return {node: {LOG_RATE_LIMIT.name: {"": limit}} for node, limit in merged.items()}
-
+from dora_systemd.decisions.cell.line_rates import HINT, RateLimits, format_rates, parse_rates
+from dora_systemd.decisions.settings.kinds import Setting, by_named_node, many_texts
 
 LOG_RATE_LIMIT = Setting[RateLimits](
     "log_rate_limit",
@@ -26,6 +12,6 @@ LOG_RATE_LIMIT = Setting[RateLimits](
     "Log lines per time to keep of each node, or of NODE; the rest is dropped and counted.",
     variable="DORA_LOG_RATE_LIMIT",
     per_node=True,
-    by_node=_by_node,
+    by_node=by_named_node("log_rate_limit", format_rates, HINT),
 )
 RUNNER_SETTINGS = {LOG_RATE_LIMIT.name: LOG_RATE_LIMIT}

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from operator import or_
 from typing import Any
 
+from dora_systemd.decisions.cell.launch import is_launched, watchdogs_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import (
     Owed,
@@ -21,10 +22,17 @@ from dora_systemd.decisions.settings.kinds import (
     Kind,
     Scalar,
     Setting,
+    by_named_node,
     listed,
     many_texts,
 )
-from dora_systemd.decisions.watchdog.watchdogs import Watchdogs, format_watchdogs, parse_watchdogs
+from dora_systemd.decisions.watchdog.watchdogs import (
+    HINT,
+    Watchdogs,
+    check_watchdogs,
+    format_watchdogs,
+    parse_watchdogs,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted, scalar_text
 
@@ -100,6 +108,11 @@ def _refusal(what: str, hint: str) -> DoraSystemdError:
     return DoraSystemdError(f"cannot use {what} as owes", hint, ExitCode.BAD_INPUT)
 
 
+def check_sockets(options: RunnerOptions, nodes: Sequence[Node]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a node that cannot have a notify socket."""
+    check_watchdogs(watchdogs_of(options), {node.id for node in nodes if is_launched(node)})
+
+
 WATCHDOG = Setting[Watchdogs](
     "watchdog",
     many_texts("a time span such as 5s", "[NODE=]TIME", parse_watchdogs, format_watchdogs, or_),
@@ -107,9 +120,16 @@ WATCHDOG = Setting[Watchdogs](
     "Time in which all nodes, or NODE, must send WATCHDOG=1; one that does not is ended.",
     variable="DORA_WATCHDOG",
     per_node=True,
+    by_node=by_named_node("watchdog", format_watchdogs, HINT),
+    check=check_sockets,
 )
 NOTIFY = Setting[bool](
-    "notify", BOOL, False, "Give the nodes a notify socket, to report their STATUS=.", per_node=True
+    "notify",
+    BOOL,
+    False,
+    "Give the nodes a notify socket, to report their STATUS=.",
+    per_node=True,
+    check=check_sockets,
 )
 SIGN_SETTINGS: tuple[Setting[Any], ...] = (WATCHDOG, NOTIFY)
-RUNNER_SETTINGS = {OWES.name: OWES}
+RUNNER_SETTINGS = {one.name: one for one in (OWES, WATCHDOG, NOTIFY)}

@@ -25,10 +25,9 @@ from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.on_failure import ON_FAILURE
-from dora_systemd.decisions.settings.owes import NOTIFY, OWES, WATCHDOG, merged_owes
+from dora_systemd.decisions.settings.owes import OWES, merged_owes
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
-from dora_systemd.decisions.settings.stops import STOP
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
     DEBUG,
@@ -37,7 +36,6 @@ from dora_systemd.decisions.settings.table import (
     SETTINGS,
     UV,
 )
-from dora_systemd.decisions.watchdog.watchdogs import ALL_NODES, Watchdogs, merge_watchdogs
 from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
 from dora_systemd.values import shown
 
@@ -242,7 +240,6 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
-        watchdogs=watchdogs(settings),
         needs=split_needs(settings[NEEDS], settings.by_node(NEEDS))[1],
         reload=hot_reload(settings, options.working_directory),
         settings=changed(tuple(runner_texts(settings)), settings.passed),
@@ -271,14 +268,6 @@ def _by_node(settings: Settings) -> dict[str, dict[str, Any]]:
         elif setting.name in MODULES and not setting.property and settings.is_given(setting):
             found[""][setting.name] = settings[setting]
     return found
-
-
-def watchdogs(settings: Settings) -> Watchdogs:
-    """Which nodes have a watchdog or a notify socket. Raises DoraSystemdError (BAD_INPUT)."""
-    # A node with a time to stop can extend it.
-    timed = {node: True for node, one in settings.by_node(STOP).items() if one and one.within}
-    sockets = {ALL_NODES: settings[NOTIFY], **timed, **settings.by_node(NOTIFY)}
-    return merge_watchdogs(settings.by_node(WATCHDOG), settings[WATCHDOG], sockets)
 
 
 def restart_policy(settings: Settings) -> RestartPolicy:

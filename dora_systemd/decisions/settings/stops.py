@@ -15,6 +15,7 @@ from dora_systemd.decisions.cell.stops import (
 )
 from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.settings.kinds import DURATION, Base, Kind, Scalar, Setting, texts_of
+from dora_systemd.decisions.settings.owes import check_sockets
 from dora_systemd.values import SECOND, scalar_text
 
 DEFAULT_STOP_LIMIT = 300 * SECOND
@@ -34,6 +35,7 @@ def _check(options: RunnerOptions, nodes: Sequence[Node]) -> None:
     stops, limit = named_stops(options.by_node("stop")), options.of_dataflow("stop_limit")
     is_apart = bool(options.placed)
     check_stops(stops.values(), limit, options.grace, [node.id for node in nodes], is_apart)
+    check_sockets(options, nodes)
 
 
 STOP = Setting[NodeStop | None](

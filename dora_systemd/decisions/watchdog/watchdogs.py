@@ -3,10 +3,9 @@
 The terms are those of WatchdogSec= in systemd.service(5) and of sd_notify(3).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import check_known
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 ALL_NODES = ""
@@ -14,7 +13,7 @@ SHORTEST = SECOND // 5
 """µs. The runner looks eight times as often, and must not notice that."""
 OFF = 0
 """The node has no notify socket."""
-_HINT = "write a time with its unit such as 5s, at least 200ms; or infinity for no watchdog"
+HINT = "write a time with its unit such as 5s, at least 200ms; or infinity for no watchdog"
 
 Watchdogs = Mapping[str, int]
 """µs by node, with ALL_NODES for the others; INFINITY: a notify socket without a watchdog."""
@@ -42,12 +41,6 @@ def parse_watchdogs(texts: Iterable[str]) -> dict[str, int]:
     return {node.strip(): parse_watchdog(limit) for node, limit in parts}
 
 
-def parse_sockets(texts: Iterable[str]) -> dict[str, int]:
-    """The inverse of format_watchdogs, for the runner's command line."""
-    parts = (text.rpartition("=")[::2] for text in texts)
-    return {node: parse_duration(limit) for node, limit in parts}
-
-
 def format_watchdogs(watchdogs: Watchdogs) -> list[str]:
     """Format watchdogs as texts, the inverse of parse_watchdogs()."""
     return [
@@ -56,16 +49,8 @@ def format_watchdogs(watchdogs: Watchdogs) -> list[str]:
     ]
 
 
-def merge_watchdogs(
-    nodes: Mapping[str, Watchdogs], given: Watchdogs, sockets: Mapping[str, bool]
-) -> dict[str, int]:
-    """Merge watchdogs for the runner. nodes: of settings files; `given` takes precedence over them.
-
-    sockets: whether nodes get a socket without a watchdog, with ALL_NODES. Raises DoraSystemdError
-    (BAD_INPUT) for a time in `nodes` that has the form NODE=TIME itself.
-    """
-    of_files = {node: _own(node, own) for node, own in nodes.items()}
-    limits = {**of_files, **given}
+def merge_watchdogs(limits: Watchdogs, sockets: Mapping[str, bool]) -> dict[str, int]:
+    """The time of each node that has a socket. sockets: whether one without a watchdog has."""
     everywhere = limits.get(ALL_NODES, INFINITY), sockets.get(ALL_NODES, False)
     found = {
         node: _socket(limits.get(node, everywhere[0]), sockets.get(node, everywhere[1]))
@@ -80,30 +65,18 @@ def _socket(limit: int, is_wanted: bool) -> int:
     return limit if limit < INFINITY or is_wanted else OFF
 
 
-def _own(node: str, watchdogs: Watchdogs) -> int:
-    for name, limit in watchdogs.items():
-        if name:
-            text = f"{name}={format_duration(limit)}"
-            message = f"cannot use {quoted(text)} as watchdog of node {node}"
-            raise DoraSystemdError(message, _HINT, ExitCode.BAD_INPUT)
-    return watchdogs[ALL_NODES]
-
-
 def watchdog_of(watchdogs: Watchdogs, node: str) -> int:
     """µs of one node, INFINITY for a socket alone, OFF for neither."""
     return watchdogs.get(node, watchdogs.get(ALL_NODES, OFF))
 
 
-def check_watchdogs(watchdogs: Watchdogs, nodes: Iterable[str], launched: Iterable[str]) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for a node that is not in `nodes`, or not in `launched`.
+def check_watchdogs(watchdogs: Watchdogs, launched: Container[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a node that is not in `launched`.
 
     launched: nodes that get their environment from our launcher.
     """
-    named = [node for node, limit in watchdogs.items() if node and limit]
-    check_known("cannot watch", named, nodes)
-    started = set(launched)
-    for node in named:
-        if node not in started:
+    for node, limit in watchdogs.items():
+        if node and limit and node not in launched:
             message = f"cannot watch the node {node}: dora itself starts it, without a socket"
             hint = (
                 "operators, dynamic nodes and nodes of ROS 2 or with path_sha256 have no watchdog"
@@ -112,4 +85,4 @@ def check_watchdogs(watchdogs: Watchdogs, nodes: Iterable[str], launched: Iterab
 
 
 def _refusal(text: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot use {quoted(text)} as watchdog", _HINT, ExitCode.USAGE)
+    return DoraSystemdError(f"cannot use {quoted(text)} as watchdog", HINT, ExitCode.USAGE)

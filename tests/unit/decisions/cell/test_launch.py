@@ -15,7 +15,7 @@ from dora_systemd.decisions.cell.launch import (
     launch_descriptor,
     python_of,
 )
-from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
+from dora_systemd.decisions.cell.options import RunnerOptions, parse_setting
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
     parse_dataflow,
@@ -23,7 +23,6 @@ from dora_systemd.decisions.descriptor.dataflow import (
     session_path,
 )
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.values import INFINITY
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 FILES = {
@@ -69,9 +68,14 @@ def words(node: dict[str, Any], given: LaunchPlan | None = None) -> list[str]:
     ("text", "prefix"), [("no", ["/usr/bin/prlimit", "--core=0:0"]), ("yes", [])]
 )
 def test_a_node_without_core_dumps(text: str, prefix: list[str]) -> None:
-    given = plan(settings=(SettingText("n", "core_dumps", text),))
+    given = plan(**texts(f"n:core_dumps={text}"))
     assert words({"path": "a.py"}, given)[4:] == [*prefix, "/usr/bin/python3", "-u", "/p/a.py"]
     assert words({"path": "a.py"})[4:] == ["/usr/bin/python3", "-u", "/p/a.py"]
+
+
+def texts(*words: str) -> dict[str, Any]:
+    """The options with [NODE:]KEY=TEXT."""
+    return {"settings": tuple(map(parse_setting, words))}
 
 
 @pytest.mark.parametrize(
@@ -83,13 +87,13 @@ def test_a_node_without_core_dumps(text: str, prefix: list[str]) -> None:
         ({"path": "bin/detector", "args": "-x 'a b' $HOME"}, {},
          ["/p", "pipe", "/p/bin/detector", "-x", "a b", "$HOME"]),
         ({"path": "cat"}, {}, ["/p", "pipe", "/usr/bin/cat"]),
-        ({"path": "cat"}, {"watchdogs": {"other": 5}}, ["/p", "pipe", "/usr/bin/cat"]),
-        ({"path": "cat"}, {"watchdogs": {"n": 5}}, ["/p", "pipe:5", "/usr/bin/cat"]),
-        ({"path": "cat"}, {"watchdogs": {"": 5, "n": INFINITY}}, ["/p", "pipe:0", "/usr/bin/cat"]),
-        ({"path": "shell", "args": "x"}, {"allow_shell_nodes": True, "watchdogs": {"": 5}},
-         ["/p", "pipe:5:any", "sh", "-c", "x"]),
-        ({"path": "cat", "send_stdout_as": "log", "outputs": ["log"]}, {"watchdogs": {"n": 5}},
-         ["/p", "keep:5", "/usr/bin/cat"]),
+        ({"path": "cat"}, texts("other:watchdog=5s"), ["/p", "pipe", "/usr/bin/cat"]),
+        ({"path": "cat"}, texts("n:watchdog=5s"), ["/p", "pipe:5000000", "/usr/bin/cat"]),
+        ({"path": "cat"}, texts("n:notify=yes"), ["/p", "pipe:0", "/usr/bin/cat"]),
+        ({"path": "shell", "args": "x"}, {"allow_shell_nodes": True, **texts("watchdog=5s")},
+         ["/p", "pipe:5000000:any", "sh", "-c", "x"]),
+        ({"path": "cat", "send_stdout_as": "log", "outputs": ["log"]}, texts("n:watchdog=5s"),
+         ["/p", "keep:5000000", "/usr/bin/cat"]),
         ({"path": "cat", "args": "-n"}, {"uv": True},
          ["/p", "pipe", "uv", "run", "/usr/bin/cat", "-n"]),
         ({"path": "tool", "deploy": {"working_dir": "/repo/flows"}}, {"uv": True},

@@ -15,7 +15,6 @@ from dora_systemd.decisions.cell.line_rates import (
     check_rates,
     format_rate,
     format_rates,
-    merge_rates,
     parse_rate,
     parse_rates,
     rate_of,
@@ -96,7 +95,6 @@ def test_a_node_in_a_file_cannot_name_another() -> None:
     document = {"nodes": {"camera": {"log_rate_limit": "lidar=5/1s"}}}
     with pytest.raises(DoraSystemdError, match=r"'lidar=5/1s' as log_rate_limit of node camera"):
         rates_of_settings(settings((), document))
-    assert merge_rates({}, {}) == {}
 
 
 def test_a_limit_must_name_a_node_that_is_there() -> None:

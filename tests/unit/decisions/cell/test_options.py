@@ -71,7 +71,6 @@ options = st.builds(
     restart=policies,
     node_restarts=st.lists(st.tuples(st.text(min_size=1), policies)).map(tuple),
     start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
-    watchdogs=st.dictionaries(nodes, st.integers(0, INFINITY)),
     reload=st.builds(
         HotReload,
         st.booleans(),

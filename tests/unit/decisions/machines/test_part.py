@@ -24,7 +24,6 @@ from dora_systemd.decisions.machines.part import (
     parse_digests,
     with_works,
 )
-from dora_systemd.decisions.watchdog.watchdogs import Watchdogs
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.fakes.manager import with_limits
 
@@ -64,9 +63,6 @@ def test_each_machine_has_its_own_nodes() -> None:
     head, member = plan().options, plan(machine="gpu").options
     assert [node.id for node in own_dataflow(head, dataflow()).nodes] == ["source"]
     assert [node.id for node in own_dataflow(member, dataflow()).nodes] == ["mid"]
-    watchdogs: Watchdogs = {"source": 1, "mid": 2}
-    assert own_options(head._replace(watchdogs=watchdogs)).watchdogs == {"source": 1}
-    assert own_options(member._replace(watchdogs=watchdogs)).watchdogs == {"mid": 2}
 
 
 def test_a_member_leaves_out_what_its_settings_say_of_other_machines() -> None:

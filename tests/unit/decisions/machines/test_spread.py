@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.cell.launch import watchdogs_of
 from dora_systemd.decisions.cell.limits import limits_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
@@ -108,8 +109,8 @@ def test_what_a_member_is_told() -> None:
         "--head=robot-1.lan",
         "--placed=yolo=gpu",
         "--set=yolo:memory_limit=4G",
+        "--set=yolo:watchdog=5s",
         "--sandbox=none",
-        "--watchdog=yolo=5s",
         "--working-directory=/home/alice/robot",
         "--env=B=2",
         "--venv=/home/alice/robot/venv",
@@ -117,7 +118,7 @@ def test_what_a_member_is_told() -> None:
     )
     assert [one.node for one in limits_of(options)] == ["camera"]
     assert [one.node for one in options.needs] == ["camera"]
-    assert not options.watchdogs
+    assert not options.has("watchdog")
 
 
 def test_a_flag_overrides_the_host_only() -> None:
@@ -130,8 +131,8 @@ def test_a_flag_overrides_the_host_only() -> None:
 def test_a_watchdog_of_all_nodes() -> None:
     flags = {"machines": ("gpu=x",), "watchdog": ("5s",)}
     options, members = spread_out(flow(on("gpu")), None, flags)
-    assert "--watchdog=yolo=5s" in words_of(members)
-    assert options.watchdogs == {"": 5_000_000, "yolo": 0}
+    assert "--set=watchdog=5s" in words_of(members)
+    assert watchdogs_of(options) == {"": 5_000_000, "yolo": 0}
 
 
 @pytest.mark.parametrize(
