@@ -267,8 +267,8 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
-        runs.nodes.gates.make({one.node for one in own.needs})
-        if own.needs:
+        runs.nodes.gates.make({*own.by_node("needs")})
+        if own.has("needs"):
             from dora_systemd.runner.needs import wait_for_needs
 
             wait_for_needs(run, own, reloader.definition, dialogue.spawn)

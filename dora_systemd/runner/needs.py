@@ -15,7 +15,7 @@ from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.host.inotify import Inotify
 from dora_systemd.adapters.host.links import LinkChanges, look_at_link
 from dora_systemd.adapters.host.presence import Presence, look_at, watched_places
-from dora_systemd.decisions.cell.needs import NET, needs_by_node
+from dora_systemd.decisions.cell.needs import NET
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import LATCHED
 from dora_systemd.decisions.life import events as life
@@ -114,14 +114,14 @@ class Needs:
         self, run: Run, options: RunnerOptions, definition: Definition, spawn: Spawn
     ) -> None:
         self._run, self._definition, self._spawn = run, definition, spawn
-        self._needs = needs_by_node(options.needs)
+        self._needs = options.by_node("needs")
         self._start_timeout = options.start_timeout
         self._passed: dict[str, list[Presence]] = {}
         self._losing: set[str] = set()
         self._closed: set[str] = set()
         self._down: set[tuple[str, int]] = set()
 
-        every = {one.what for one in options.needs}
+        every = {one for needs in self._needs.values() for one in needs}
         self._paths = {one for one in every if not one.startswith(NET)}
         self._watch = Watch(has_links=every != self._paths)
 

@@ -11,10 +11,8 @@ from dora_systemd.adapters.host import files
 from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
 from dora_systemd.decisions.cell.launch import (
     LaunchPlan,
-    is_launched,
     launch_descriptor,
 )
-from dora_systemd.decisions.cell.needs import check_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
 from dora_systemd.decisions.descriptor.dataflow import (
@@ -77,7 +75,6 @@ def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
     _check_limited(options, dataflow)
     ids = [node.id for node in dataflow.nodes]
     check_reload_nodes(options.reload, ids)
-    check_needs(options.needs, {node.id: is_launched(node) for node in dataflow.nodes})
 
 
 def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:

@@ -171,7 +171,7 @@ def _keys_of_kept(node: str, options: RunnerOptions) -> Mapping[str, Any]:
     """The restart keys of a node without restarts that dora must not give up at once."""
     if options.hot_reload:
         return HELD_KEYS
-    return LATCH_KEYS if any(one.node == node for one in options.needs) else {}
+    return LATCH_KEYS if node in options.by_node("needs") else {}
 
 
 def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:

@@ -5,12 +5,14 @@ the runner waits for them. `NODE=PATH` is the need of a node where no key names 
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
+from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import check_known, did_you_mean, is_name, is_node_id
+from dora_systemd.names import did_you_mean, is_name, is_node_id
 from dora_systemd.values import quoted
 
 NETWORK, CLOCK = "network", "clock"
@@ -101,10 +103,10 @@ def is_foreign(need: str) -> bool:
     return need.startswith(FOREIGN)
 
 
-def split_needs(
+def needs_by_node(
     given: tuple[str, ...], by_node: Mapping[str, tuple[str, ...]]
-) -> tuple[tuple[str, ...], tuple[NodeNeed, ...]]:
-    """The needs of the dataflow, and those of nodes.
+) -> dict[str, tuple[str, ...]]:
+    """The needs of each node.
 
     given: of the dataflow, and with a node in front. by_node: from `nodes:` in settings files.
     Raises DoraSystemdError (BAD_INPUT) for a path or an interface that the dataflow needs, and for
@@ -119,10 +121,10 @@ def split_needs(
         )
     for node, texts in by_node.items():
         _check_of_node(node, texts)
-    named = [NodeNeed(*one.split("=", 1)) for one in given if _is_of_node(one)]
-    listed = [NodeNeed(node, one) for node, texts in by_node.items() for one in texts]
-    of_dataflow = tuple(one for one in given if not _is_of_node(one))
-    return of_dataflow, tuple(dict.fromkeys((*listed, *named)))
+    found = dict(by_node)
+    for node, what in (one.split("=", 1) for one in given if _is_of_node(one)):
+        found[node] = tuple(dict.fromkeys((*found.get(node, ()), what)))
+    return found
 
 
 def _is_of_node(need: str) -> bool:
@@ -141,31 +143,18 @@ def _check_of_node(node: str, needs: Sequence[str]) -> None:
         )
 
 
-def check_needs(needs: Sequence[NodeNeed], nodes: Mapping[str, bool]) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for a need of a node that cannot wait.
+@lru_cache(maxsize=4)
+def needs_of(options: RunnerOptions) -> tuple[NodeNeed, ...]:
+    """What single nodes wait for. Raises DoraSystemdError."""
+    needs = options.by_node("needs")
+    return tuple(NodeNeed(node, what) for node, own in needs.items() for what in own)
 
-    nodes: by id, whether our launcher starts the node.
-    """
-    check_known("cannot wait for what is needed by", {one.node: one for one in needs}, [*nodes])
-    if other := next((one for one in needs if not nodes[one.node]), None):
+
+def check_needs(needs: Sequence[NodeNeed], launched: Container[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a need of a node that our launcher does not start."""
+    if other := next((one for one in needs if one.node not in launched), None):
         raise DoraSystemdError(
             f"node {other.node} cannot wait for {other.what}: dora itself starts this node",
             "operators, ros2, dynamic nodes and path_sha256: write needs: for another node",
             ExitCode.BAD_INPUT,
         )
-
-
-def parse_node_need(text: str) -> NodeNeed:
-    """The need of a node in the runner's command line. Raises DoraSystemdError (USAGE)."""
-    [need] = parse_needs([text])
-    if not _is_of_node(need):
-        raise _refusal(text, "write NODE=PATH or NODE=net:INTERFACE")
-    return NodeNeed(*need.split("=", 1))
-
-
-def needs_by_node(needs: Sequence[NodeNeed]) -> dict[str, tuple[str, ...]]:
-    """Return what each node needs, in its order."""
-    found: dict[str, tuple[str, ...]] = {}
-    for node, what in needs:
-        found[node] = (*found.get(node, ()), what)
-    return found

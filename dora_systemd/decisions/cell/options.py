@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.machines import Placed, parse_head, parse_machine, parse_placed
-from dora_systemd.decisions.cell.needs import NodeNeed, parse_node_need
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
     RestartPolicy,
@@ -51,6 +50,7 @@ MODULES = {
     "log_rate_limit": "log_rates",
     "memory_high": "limits",
     "memory_limit": "limits",
+    "needs": "needs",
     "nice": "limits",
     "notify": "owes",
     "oom_score_adjust": "rights",
@@ -96,7 +96,6 @@ class RunnerOptions(NamedTuple):
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()  # policies of single nodes
     start_timeout: int = INFINITY  # µs for all nodes to become ready, or INFINITY
     reload: HotReload = DEFAULT_RELOAD  # files that cause a reload, and how nodes are replaced
-    needs: tuple[NodeNeed, ...] = ()  # paths and interfaces that single nodes wait for
     settings: tuple[SettingText, ...] = ()  # see dora_systemd.decisions.settings
     placed: tuple[Placed, ...] = ()  # the nodes that run on other machines than the head
     # machine, head: on a member its name, and the host name of the head; else ""
@@ -247,7 +246,6 @@ _OPTIONS = (
     _unless_default("start-timeout", "start_timeout", parse_duration, format_duration),
     _each("env-key", "env_keys"),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
-    _each("needs", "needs", parse_node_need, "=".join),
     _each("set", "settings", parse_setting, format_setting),
     _each("placed", "placed", parse_placed, "=".join),
     _unless_default("machine", "machine", parse_machine),

@@ -27,7 +27,6 @@ def is_here(options: RunnerOptions, node: str) -> bool:
 def own_options(options: RunnerOptions) -> RunnerOptions:
     """Return the options without those for nodes of other machines."""
     return options._replace(
-        needs=tuple(one for one in options.needs if is_here(options, one.node)),
         settings=tuple(
             one for one in options.settings if not one.node or is_here(options, one.node)
         ),

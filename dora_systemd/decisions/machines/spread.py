@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from dora_systemd.decisions.cell.launch import is_launched
 from dora_systemd.decisions.cell.machines import HEAD, Placed, is_host_name, members_of
+from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import owes_of
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
@@ -248,7 +249,7 @@ def _refused(options: RunnerOptions, settings: Settings) -> Iterator[tuple[str, 
             reason = f"node {one.node} is on machine {away[one.node]}, and owes an output"
             yield reason, "leave owes of this node out"
     # The head starts all nodes by dora, and would take a node that waits on a member for late.
-    for need in options.needs:
+    for need in needs_of(options):
         if need.node in away:
             reason = f"node {need.node} is on machine {away[need.node]}, and waits for {need.what}"
             yield reason, "leave needs of this node out"

@@ -10,7 +10,6 @@ from pathlib import PurePath
 from typing import Any, TypeVar, cast
 
 from dora_systemd.decisions.cell.hot_reload import HotReload
-from dora_systemd.decisions.cell.needs import split_needs
 from dora_systemd.decisions.cell.options import (
     MODULES,
     RunnerOptions,
@@ -23,7 +22,6 @@ from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_va
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
-from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.on_failure import ON_FAILURE
 from dora_systemd.decisions.settings.owes import OWES, merged_owes
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
@@ -240,7 +238,6 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
-        needs=split_needs(settings[NEEDS], settings.by_node(NEEDS))[1],
         reload=hot_reload(settings, options.working_directory),
         settings=changed(tuple(runner_texts(settings)), settings.passed),
         on_failure=settings[ON_FAILURE],

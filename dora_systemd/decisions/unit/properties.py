@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dora_systemd.decisions.cell.environment import checked_variable, environment_entries
+from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     post_command,
@@ -269,7 +270,7 @@ def device_properties(options: RunnerOptions, context: UnitContext) -> dict[str,
     """DeviceAllow= for the devices that nodes wait for, where the sandbox closes all others."""
     if context.sandbox is None or not context.sandbox.has_mounts:
         return {}
-    return with_assignments({}, [f"DeviceAllow={one}" for one in device_entries(options.needs)])
+    return with_assignments({}, [f"DeviceAllow={one}" for one in device_entries(needs_of(options))])
 
 
 def realtime_properties(settings: Settings) -> dict[str, Property]:

@@ -161,7 +161,7 @@ def held_notes(manager: Manager, name: str) -> Iterator[str]:
 
 def waiting_notes(manager: Manager, options: RunnerOptions) -> Iterator[str]:
     """Yield what a started dataflow waits for, from its STATUS=."""
-    if options.needs:
+    if options.has("needs"):
         text = str(manager.read(unit_name(options.name), ["StatusText"])["StatusText"])
         if WAITS in text:
             yield text

@@ -10,6 +10,7 @@ from dora_systemd.adapters.dora.preparation import PACKAGE
 from dora_systemd.adapters.host.files import absolute_path
 from dora_systemd.decisions.cell.launch import LaunchPlan, python_of
 from dora_systemd.decisions.cell.limits import has_cpus, limits_of
+from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import has_process_rights, rights_of
 from dora_systemd.decisions.cell.uv import uv_project
@@ -59,9 +60,9 @@ def make_sandbox(
         network=settings[NETWORK],
         is_user=scope.is_user,
         is_root=user is not None and user.pw_uid == 0,
-        has_devices=bool(settings[DEVICE] or device_entries(options.needs))
+        has_devices=bool(settings[DEVICE] or device_entries(needs_of(options)))
         or _names(settings, "DeviceAllow"),
-        has_can=needs_can(options.needs),
+        has_can=needs_can(needs_of(options)),
         is_realtime=settings[REALTIME] is not None or any(one.priority for one in rights),
         has_rights=has_process_rights(rights) or any(map(has_cpus, limits_of(options))),
         # In a user namespace the given capabilities would have no effect.

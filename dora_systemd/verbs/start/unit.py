@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
+from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.properties.assignments import (
     NOTHING_NEWER,
     Newer,
@@ -56,7 +57,7 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
         *plan.warnings,
         *idle_warnings(plan.settings),
         *watch_warnings(plan),
-        *needs_warnings(needs, plan.options.needs, plan.sandbox, allowed),
+        *needs_warnings(needs, needs_of(plan.options), plan.sandbox, allowed),
     )
     warnings = (*warnings, *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))

@@ -6,12 +6,14 @@ from dora_systemd.decisions.cell.needs import (
     NodeNeed,
     check_needs,
     needs_by_node,
+    needs_of,
     parse_needs,
-    parse_node_need,
-    split_needs,
 )
+from dora_systemd.decisions.cell.options import format_runner_argv, parse_runner_argv
 from dora_systemd.decisions.needs.units import needs_properties
+from dora_systemd.decisions.settings.resolve import resolve_settings, with_settings
 from dora_systemd.errors import DoraSystemdError
+from tests.unit.fakes.manager import options as runner_options
 
 
 def test_each_need_is_kept_once_and_in_its_shortest_form() -> None:
@@ -81,14 +83,13 @@ def test_an_interface_that_cannot_be_is_refused(name: str) -> None:
 def test_an_interface_is_kept_as_the_kernel_names_it() -> None:
     texts = ("net:fifteen-letters", "arm=net:can0", "net:a=b", "arm=net:enp3s0.7@", "net:7")
     assert parse_needs(texts) == texts
-    _, nodes = split_needs(("arm=net:can0",), {"base": ("net:a=b", "/dev/a=/b")})
-    assert needs_by_node(nodes) == {"base": ("net:a=b", "/dev/a=/b"), "arm": ("net:can0",)}
-    assert parse_node_need("arm=net:a=b") == NodeNeed("arm", "net:a=b")
+    nodes = needs_by_node(("arm=net:can0",), {"base": ("net:a=b", "/dev/a=/b")})
+    assert nodes == {"base": ("net:a=b", "/dev/a=/b"), "arm": ("net:can0",)}
 
 
 def test_a_dataflow_needs_no_interface() -> None:
     with pytest.raises(DoraSystemdError) as caught:
-        split_needs(("net:can0",), {})
+        needs_by_node(("net:can0",), {})
     assert caught.value.message.endswith("a network interface is what a node needs")
     assert "nodes: NODE: needs: net:can0" in caught.value.hint
 
@@ -101,35 +102,34 @@ def test_a_word_that_is_nearly_right_gets_a_hint() -> None:
 
 def test_paths_are_for_nodes_and_units_for_the_dataflow() -> None:
     given = ("network", "camera=/dev/video0")
-    needs = split_needs(given, {"arm": ("/dev/ttyUSB0", "/dev/ttyUSB1")})
-    nodes = (
-        NodeNeed("arm", "/dev/ttyUSB0"),
-        NodeNeed("arm", "/dev/ttyUSB1"),
-        NodeNeed("camera", "/dev/video0"),
-    )
-    assert needs == (("network",), nodes)
-    assert needs_by_node(nodes)["arm"] == ("/dev/ttyUSB0", "/dev/ttyUSB1")
+    assert needs_by_node(given, {"arm": ("/dev/ttyUSB0", "/dev/ttyUSB1")}) == {
+        "arm": ("/dev/ttyUSB0", "/dev/ttyUSB1"),
+        "camera": ("/dev/video0",),
+    }
     with pytest.raises(DoraSystemdError):
-        split_needs(("/dev/video0",), {})
+        needs_by_node(("/dev/video0",), {})
     for texts in (("network",), ("b=/x",)):
         with pytest.raises(DoraSystemdError):
-            split_needs((), {"a": texts})
+            needs_by_node((), {"a": texts})
 
 
 def test_the_need_of_a_node_survives_the_command_line() -> None:
-    need = NodeNeed("camera.left", "/dev/v4l/by-id/a=b")
-    assert parse_node_need("=".join(need)) == need
-    with pytest.raises(DoraSystemdError):
-        parse_node_need("network")
+    file = "/srv/robot.systemd.yml"
+    document = {"nodes": {"camera.left": {"needs": ["/dev/v4l/by-id/a=b", "net:can0"]}}}
+    settings = resolve_settings({"needs": ("arm=/dev/a", "network")}, {}, [(file, document)])
+    argv = format_runner_argv(with_settings(runner_options(), settings))
+    assert needs_of(parse_runner_argv(argv)) == (
+        NodeNeed("camera.left", "/dev/v4l/by-id/a=b"),
+        NodeNeed("camera.left", "net:can0"),
+        NodeNeed("arm", "/dev/a"),
+    )
 
 
 def test_a_node_that_dora_starts_itself_cannot_wait() -> None:
     need = [NodeNeed("camera", "/dev/video0")]
-    check_needs(need, {"camera": True})
-    for nodes in ({"camera": False}, {"camra": True}):
-        with pytest.raises(DoraSystemdError) as caught:
-            check_needs(need, nodes)
-        assert "camera" in caught.value.message
+    check_needs(need, {"camera"})
+    with pytest.raises(DoraSystemdError, match="node camera cannot wait for /dev/video0"):
+        check_needs(need, {"other"})
 
 
 def test_needs_become_dependencies_of_the_unit() -> None:

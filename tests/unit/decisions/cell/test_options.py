@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS, HotReload
 from dora_systemd.decisions.cell.line_rates import ALL_NODES
-from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import (
     MODULES,
     RunnerOptions,
@@ -79,9 +78,6 @@ options = st.builds(
         st.lists(st.tuples(idents, texts)).map(tuple),
         st.lists(st.tuples(st.just("") | idents, st.sampled_from(REPLACE_WORDS))).map(tuple),
     ),
-    needs=st.lists(
-        st.builds(NodeNeed, idents, st.sampled_from(["/dev/video0", "/dev/by-id/a=b c", "/é"]))
-    ).map(tuple),
 )
 
 

@@ -10,7 +10,6 @@ import pytest
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.limits import limits_of, node_limits
 from dora_systemd.decisions.cell.machines import Placed
-from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.machines.part import (
@@ -25,7 +24,7 @@ from dora_systemd.decisions.machines.part import (
     with_works,
 )
 from dora_systemd.errors import DoraSystemdError
-from tests.unit.fakes.manager import with_limits
+from tests.unit.fakes.manager import with_limits, with_texts
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 PLACED = (Placed("mid", "gpu"),)
@@ -67,10 +66,9 @@ def test_each_machine_has_its_own_nodes() -> None:
 
 def test_a_member_leaves_out_what_its_settings_say_of_other_machines() -> None:
     """Its project may be a copy of the head's, with the same settings file."""
-    need = NodeNeed("source", "/dev/video0")
     head, member = plan().options, plan(machine="gpu").options
-    assert own_options(head._replace(needs=(need,))).needs == (need,)
-    assert own_options(member._replace(needs=(need,))).needs == ()
+    assert own_options(with_texts(head, "source:needs=/dev/video0")).has("needs")
+    assert not own_options(with_texts(member, "source:needs=/dev/video0")).has("needs")
     limits = node_limits("source", {"tasks": 1}), node_limits("mid", {"tasks": 2})
     assert limits_of(own_options(with_limits(member, *limits))) == limits[1:]
 

@@ -8,6 +8,7 @@ import pytest
 from dora_systemd.decisions.cell.launch import watchdogs_of
 from dora_systemd.decisions.cell.limits import limits_of
 from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.decisions.cell.options import format_runner_argv as runner_argv
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
@@ -117,7 +118,7 @@ def test_what_a_member_is_told() -> None:
         "--memory-limit=8G",
     )
     assert [one.node for one in limits_of(options)] == ["camera"]
-    assert [one.node for one in options.needs] == ["camera"]
+    assert [one.node for one in needs_of(options)] == ["camera"]
     assert not options.has("watchdog")
 
 

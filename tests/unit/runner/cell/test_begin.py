@@ -12,7 +12,6 @@ from dora_systemd.adapters.cgroup.groups import SUPERVISOR, group_of
 from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN
 from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
@@ -31,7 +30,7 @@ from dora_systemd.runner.cell.begin import (
     start_daemon,
 )
 from tests.unit.fakes.cgroups import fake_cgroups
-from tests.unit.fakes.manager import options, with_limits
+from tests.unit.fakes.manager import options, with_limits, with_texts
 from tests.unit.fakes.programs import make_program
 
 OWN = ("DORA_QUIET", "RUST_BACKTRACE", "PERL_BADLANG")
@@ -98,7 +97,7 @@ def test_what_the_daemon_and_the_launcher_are_told(
 
 
 def test_rights_of_nodes_are_told_if_there_are_any(paths: CellPaths) -> None:
-    runner = options(needs=(NodeNeed("a", "/dev/x"),))
+    runner = with_texts(options(), "a:needs=/dev/x")
     assert "DORA_SYSTEMD_RIGHTS" not in variables(paths, {}, runner)
 
 
