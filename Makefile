@@ -48,6 +48,10 @@ history:  ## commands and faults in combination; SEED=n STEPS=n HOURS=n, LAB_OUT
 	@$(PREPARE) $(if $(filter vm machines,$(LAB)),container $(LAB),container)
 	@SEED=$(SEED) STEPS=$(STEPS) HOURS=$(HOURS) $(CHECK) history
 
+stops:  ## STOPS=n stops of all kinds, and what a recorder loses; LAB=vm restarts the machine, too
+	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
+	@STOPS=$(STOPS) $(CHECK) stops
+
 power:  ## the power fails ROUNDS=n times in the middle of a deploy or rollback; SEED=n
 	@$(PREPARE) container vm
 	@ROUNDS=$(ROUNDS) SEED=$(SEED) $(CHECK) power
@@ -128,4 +132,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm emulator faults history power fuzz mutants browser machines bench bench-quick bookworm forky canary lint demo clean deb wheels autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm emulator faults history stops power fuzz mutants browser machines bench bench-quick bookworm forky canary lint demo clean deb wheels autopkgtest

@@ -35,6 +35,8 @@ WITH_TOOLS = (
     "tests/unit/decisions/dora/test_command.py",
     "tests/unit/project/test_manpages.py",
 )
+# Stops between two restarts of a machine, which come after other kinds of stops each time.
+STAGE = 9
 # What `make test` runs on the next Debian: what differs there.
 NEW = "versions or doctor or units or life or newer or account or ordinary"
 # Far more than any test takes: one that hangs fails and shows where, and the others run.
@@ -238,6 +240,17 @@ def plan_history(form: str) -> list[Step]:
     return [Step(f"histories, {where}", [*command, *chosen, *kept], in_lab(where))]
 
 
+def plan_stops(form: str) -> list[Step]:
+    """Stops of all kinds, STOPS of them; a machine restarts after every STAGE of them."""
+    left, form = int(os.environ.get("STOPS") or "26"), form if form in MACHINES else "container"
+    stage = STAGE if form in MACHINES else left
+    command = ["tests/lab/lab", "run", "--"]
+    for begun in range(0, left, stage):
+        command += ["--reboot--"] if begun else []
+        command += ["python", "-m", "tests.stops", str(min(stage, left - begun))]
+    return [Step(f"stops, {form}", command, in_lab(form))]
+
+
 def plan_power(_form: str) -> list[Step]:
     """The power fails in the middle of deploys and rollbacks, as often as ROUNDS says."""
     words = [os.environ.get("ROUNDS") or "10", os.environ.get("SEED") or "1"]
@@ -339,6 +352,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "quick": plan_quick,
     "faults": plan_faults,
     "history": plan_history,
+    "stops": plan_stops,
     "power": plan_power,
     "canary": plan_canary,
     "fuzz": plan_fuzz,

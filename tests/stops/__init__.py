@@ -1,0 +1,1 @@
+"""Stops of all kinds, and what a recorder has lost: python -m tests.stops COUNT."""
