@@ -88,6 +88,7 @@ class LogPipes:
 
     def forget(self, node_id: str) -> None:
         """Drain, close and remove the pipes of a node that does not come back."""
+        self._source(node_id).drained = 0  # nothing can stay in a pipe that is removed
         self.drain(node_id)
         source = self._sources.pop(node_id)
         if source.pipes:
@@ -138,15 +139,21 @@ class LogPipes:
             source.renew(run=run_id)
 
     def drain(self, node_id: str, is_live: bool = False) -> None:
-        """Queue what is in a node's pipes, before an event. is_live: with a partial last line."""
+        """Queue what is in a node's pipes, before an event.
+
+        is_live: the node may be in the middle of a line. A line is never ended while the rest of it
+        may be in the pipe.
+        """
         source = self._source(node_id)
         for pipe in source.pipes:
             # Above the limit while journald takes nothing: the lines are safe in the pipe.
-            while source.drained < DRAIN_LIMIT and (data := pipe.read()):
+            while source.drained < DRAIN_LIMIT:
+                data = pipe.read()
+                if data or not is_live:
+                    self._put(node_id, pipe, data, is_flood=bool(data))
+                if not data:
+                    break
                 source.drained += len(data)
-                self._put(node_id, pipe, data, is_flood=True)
-            if not is_live:
-                self._put(node_id, pipe, b"", is_flood=False)
         self._tell_suppressed(node_id)
         if not self._queue.waiting(node_id):
             source.drained = 0

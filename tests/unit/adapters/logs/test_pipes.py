@@ -446,3 +446,44 @@ def test_a_drain_reads_no_more_than_it_may_keep(tmp_path: Path) -> None:
         os.close(fd)
 
     run(tmp_path, scenario)
+
+
+def flood_without_journald(cell: Cell, root: Path, count: int) -> int:
+    """Fill the pipe and drain it, with journald away; returns the number of lines of 15 bytes."""
+    cell.node("a")
+    cell.server.close()
+    (root / "socket").unlink()
+    fd, numbers = os.open(cell.paths.node_stdout("a"), os.O_WRONLY | os.O_NONBLOCK), 0
+    with contextlib.suppress(BlockingIOError):  # so many bytes fit into the pipe
+        while numbers < count:
+            os.write(fd, b"".join(b"%08d flood\n" % (numbers + one) for one in range(250)))
+            numbers += 250
+            if not numbers % 1000:  # more than a drain reads at once
+                cell.pipes.drain("a")
+    os.close(fd)
+    return numbers
+
+
+def bind_journald(cell: Cell, root: Path) -> None:
+    cell.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+    cell.server.bind(str(root / "socket"))
+
+
+def test_a_drain_that_reaches_its_limit_ends_no_line(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        numbers = flood_without_journald(cell, tmp_path, 99_999)
+        cell.pipes.drain("a")
+        bind_journald(cell, tmp_path)
+        assert await cell.messages(numbers) == [f"{one:08d} flood" for one in range(numbers)]
+
+    run(tmp_path, scenario)
+
+
+def test_a_pipe_that_is_removed_is_read_beyond_the_limit(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        numbers = flood_without_journald(cell, tmp_path, 99_999)
+        cell.pipes.forget("a")
+        bind_journald(cell, tmp_path)
+        assert await cell.messages(numbers) == [f"{one:08d} flood" for one in range(numbers)]
+
+    run(tmp_path, scenario)
