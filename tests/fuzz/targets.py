@@ -51,6 +51,9 @@ from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.description import Facts, parse_facts, problems, summary
 from dora_systemd.decisions.needs.links import link_problem, parse_link
 from dora_systemd.decisions.properties.assignments import parse_property
+from dora_systemd.decisions.recorder.reading import Reading
+from dora_systemd.decisions.recorder.ring import ALIGN
+from dora_systemd.decisions.recorder.writer import Writer
 from dora_systemd.decisions.releases.parcel import (
     format_parcel,
     missing,
@@ -67,8 +70,11 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import name_from_path, parse_name, parse_uuid
 from dora_systemd.terminal_text import one_line, shown_log, without_sequences
 from dora_systemd.values import parse_bool, parse_cpu, parse_duration, parse_size
+from tests.unit.fakes.recorder.ring import PAGE, MemoryStore
 
 FILE = Path("/fuzz/dataflow.yml")
+_RING_PART, _RING_PARTS = 512, 4
+"""Bytes of each part of a ring in the corpus, and number of parts: header, state, tape."""
 SMALL_LIMIT = 8
 """Bytes of a line, small so that short inputs have long lines."""
 
@@ -135,6 +141,18 @@ def _machine_facts(data: bytes) -> None:
     own = Facts("0.1.0", "1.1.0", "/usr/bin/doractl", "alice", True, 5)
     shown = [*problems(own, facts, facts.now - own.now), summary(facts, facts.now - own.now)]
     str(shown).encode()
+
+
+def _ring(data: bytes) -> None:
+    """The corpus has the parts of a ring without the holes between them."""
+    header, rest = data[:_RING_PART], data[_RING_PART:]
+    store = MemoryStore(_RING_PARTS * ALIGN)
+    for at in range(_RING_PARTS):
+        part = header if at == 0 else rest[(at - 1) * _RING_PART : at * _RING_PART]
+        store.write(at * ALIGN, [part])
+    size = sum(one.head.size for one in Reading(store, store.size, ALIGN).messages())
+    assert size <= ALIGN
+    Writer(store, PAGE)
 
 
 def _encoded(fields: Any) -> None:
@@ -249,6 +267,7 @@ TARGETS = {
     ),
     "exit": Target(_of_text(parse_exit, parse_dora_error, parse_filter)),
     "parcel": Target(_parcel, REFUSED),
+    "ring": Target(_ring, (ValueError,)),
     "link": Target(_link),
     "dora-version": Target(
         lambda data: version_numbers(parse_dora_version(text_of(data)) or text_of(data))

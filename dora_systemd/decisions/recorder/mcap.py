@@ -1,0 +1,188 @@
+"""Writes MCAP, see https://mcap.dev/spec: chunks with an index and CRCs, without compression.
+
+Messages of a camera do not compress, and Python has zstd from 3.14 on only. Nothing that was
+written is read or changed again, so the file can be a pipe.
+"""
+
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+Write = Callable[[bytes], object]
+
+MAGIC = b"\x89MCAP0\r\n"
+CHUNK_SIZE = 1024 * 1024
+"""Bytes after which a chunk ends."""
+MOST_CHANNELS = 4096
+MAX_TIME = (1 << 63) - 1
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
+_STATISTICS, _METADATA, _METADATA_INDEX, _SUMMARY_OFFSET, _DATA_END = range(0x0B, 0x10)
+_RECORD = struct.Struct("<BQ")
+_HEAD = struct.Struct("<HIQQ")
+_COUNTS = struct.Struct("<QHIIIIQQ")
+_SPAN = struct.Struct("<QQ")
+
+
+def _text(text: str) -> bytes:
+    data = text.encode(errors="replace")
+    return struct.pack("<I", len(data)) + data
+
+
+def _mapping(pairs: Iterable[tuple[bytes, bytes]]) -> bytes:
+    data = b"".join(key + value for key, value in pairs)
+    return struct.pack("<I", len(data)) + data
+
+
+def _texts(texts: Mapping[str, str]) -> bytes:
+    return _mapping((_text(key), _text(value)) for key, value in texts.items())
+
+
+def _numbers(form: str, numbers: Mapping[int, int]) -> bytes:
+    return _mapping((struct.pack("<H", key), struct.pack(form, n)) for key, n in numbers.items())
+
+
+def _record(opcode: int, *parts: bytes) -> bytes:
+    content = b"".join(parts)
+    return _RECORD.pack(opcode, len(content)) + content
+
+
+def _time(time_ns: int) -> int:
+    return min(max(time_ns, 0), MAX_TIME)
+
+
+class Times(NamedTuple):
+    """The times of the first and of the last message."""
+
+    first: int = MAX_TIME
+    last: int = 0
+
+    def with_time(self, time_ns: int) -> "Times":
+        """The times with one more message."""
+        return Times(min(self.first, time_ns), max(self.last, time_ns))
+
+    def pack(self) -> bytes:
+        """Both in a record; 0 without messages."""
+        return _SPAN.pack(*(self if self.first <= self.last else (0, 0)))
+
+
+class McapWriter:
+    """Writes one file. library: the program, for the header."""
+
+    def __init__(self, write: Write, library: str) -> None:
+        self._write = write
+        self._offset = self._crc = 0
+        self._channels: dict[tuple[str, bytes], int] = {}
+        self._schemas: list[bytes] = []
+        self._definitions: list[bytes] = []
+        self._counts: dict[int, int] = {}
+        self._times, self._chunk_times = Times(), Times()
+        self._chunk: list[bytes] = []
+        self._size = 0
+        self._index: dict[int, list[bytes]] = {}
+        self._chunk_indexes: list[bytes] = []
+        self._metadata_indexes: list[bytes] = []
+        self._put(MAGIC)
+        self._put(_record(_HEADER, _text(""), _text(library)))
+
+    def _put(self, data: bytes) -> int:
+        """Write into the file; return where that began."""
+        before = self._offset
+        self._write(data)
+        self._crc = zlib.crc32(data, self._crc)
+        self._offset += len(data)
+        return before
+
+    def add_metadata(self, name: str, texts: Mapping[str, str]) -> None:
+        """Write texts about the whole file."""
+        self._end_chunk()
+        data = _record(_METADATA, _text(name), _texts(texts))
+        place = _SPAN.pack(self._put(data), len(data))
+        self._metadata_indexes.append(_record(_METADATA_INDEX, place, _text(name)))
+
+    def channel(self, topic: str, encoding: str, schema: bytes = b"") -> int | None:
+        """The channel of a topic whose messages have this schema, or None if there are too many."""
+        key = topic, schema
+        if key not in self._channels:
+            if len(self._channels) >= MOST_CHANNELS:
+                return None
+            self._channels[key] = len(self._channels)
+            self._define(self._channels[key], topic, encoding, schema)
+        return self._channels[key]
+
+    def _define(self, number: int, topic: str, encoding: str, schema: bytes) -> None:
+        identity = len(self._schemas) + 1 if schema else 0
+        if schema:
+            data = struct.pack("<I", len(schema)), schema
+            head = struct.pack("<H", identity)
+            self._schemas.append(_record(_SCHEMA, head, _text(topic), _text(encoding), *data))
+            self._add(self._schemas[-1])
+        head = struct.pack("<HH", number, identity)
+        record = _record(_CHANNEL, head, _text(topic), _text(encoding), _texts({}))
+        self._definitions.append(record)
+        self._add(record)
+
+    def message(self, channel: int, sequence: int, log: int, publish: int, data: bytes) -> None:
+        """Write a message. log, publish: ns since 1970."""
+        log, publish = _time(log), _time(publish)
+        self._index.setdefault(channel, []).append(_SPAN.pack(log, self._size))
+        self._counts[channel] = self._counts.get(channel, 0) + 1
+        self._times, self._chunk_times = (
+            self._times.with_time(log),
+            self._chunk_times.with_time(log),
+        )
+        head = _HEAD.pack(channel, sequence % (1 << 32), log, publish)
+        self._add(_RECORD.pack(_MESSAGE, len(head) + len(data)) + head, data)
+        if self._size >= CHUNK_SIZE:
+            self._end_chunk()
+
+    def _add(self, *parts: bytes) -> None:
+        self._chunk += parts
+        self._size += sum(map(len, parts))
+
+    def _end_chunk(self) -> None:
+        if not self._chunk:
+            return
+        records, span = b"".join(self._chunk), self._chunk_times.pack()
+        sizes = struct.pack("<QI", len(records), zlib.crc32(records)), _text("")
+        start = self._put(_record(_CHUNK, span, *sizes, struct.pack("<Q", len(records)), records))
+        length, places = self._offset - start, dict[int, int]()
+        for channel, entries in self._index.items():
+            index = struct.pack("<HI", channel, sum(map(len, entries)))
+            places[channel] = self._put(_record(_MESSAGE_INDEX, index, *entries))
+        index_length = self._offset - start - length
+        place, indexes = _SPAN.pack(start, length), _numbers("<Q", places)
+        ends = struct.pack("<Q", index_length), _text(""), _SPAN.pack(len(records), len(records))
+        self._chunk_indexes.append(_record(_CHUNK_INDEX, span, place, indexes, *ends))
+        self._chunk, self._size, self._index, self._chunk_times = [], 0, {}, Times()
+
+    def finish(self) -> None:
+        """Write the summary and the end."""
+        self._end_chunk()
+        self._put(_record(_DATA_END, struct.pack("<I", self._crc)))
+        start, self._crc = self._offset, 0
+        counts = (
+            *(sum(self._counts.values()), len(self._schemas), len(self._channels), 0),
+            *(len(self._metadata_indexes), len(self._chunk_indexes)),
+        )
+        times = _SPAN.unpack(self._times.pack())
+        statistics = _record(
+            _STATISTICS, _COUNTS.pack(*counts, *times), _numbers("<Q", self._counts)
+        )
+        groups = {
+            _SCHEMA: self._schemas,
+            _CHANNEL: self._definitions,
+            _STATISTICS: [statistics],
+            _CHUNK_INDEX: self._chunk_indexes,
+            _METADATA_INDEX: self._metadata_indexes,
+        }
+        offsets = [self._put_group(*group) for group in groups.items() if group[1]]
+        offset = self._put(b"".join(offsets))
+        footer = _RECORD.pack(_FOOTER, _SPAN.size + 4) + _SPAN.pack(start, offset)
+        self._put(footer + struct.pack("<I", zlib.crc32(footer, self._crc)))
+        self._put(MAGIC)
+
+    def _put_group(self, opcode: int, records: list[bytes]) -> bytes:
+        data = b"".join(records)
+        start = self._put(data)
+        return _record(_SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, len(data)))

@@ -1,0 +1,142 @@
+"""Reads a ring, while its recorder writes to it or after the end of that.
+
+The nodes' user can write to the ring. A reader reads at most `most` bytes of messages, believes no
+length, and gives up a tape at the first record that is none. What it returns is bytes and numbers:
+nobody but the program that reads the file interprets Arrow.
+"""
+
+import heapq
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol
+
+from dora_systemd.decisions.recorder.ring import (
+    ALIGN,
+    RECORD_SIZE,
+    Header,
+    RecordHead,
+    State,
+    format_record,
+    parse_header,
+    parse_record,
+    read_state,
+    read_tape,
+    size_of,
+)
+
+_TRIES = 8
+"""Reads of a state that its recorder writes at the same time."""
+
+
+class Source(Protocol):
+    """The file of a ring, for readers."""
+
+    def read(self, at: int, size: int) -> bytes:
+        """Read; what is a hole is 0, and less comes at the end of the file."""
+
+
+class Recorded(NamedTuple):
+    """One message of a ring."""
+
+    output: int  # its place in the outputs of the header
+    head: RecordHead
+    schema: bytes
+    meta: bytes
+    data: bytes
+
+
+class Reading:
+    """A ring, read once from its oldest message to its last. Raises ValueError for no ring.
+
+    size: bytes of the file. most: bytes of messages that are read.
+    """
+
+    def __init__(self, source: Source, size: int, most: int) -> None:
+        self._source = source
+        self.header: Header = parse_header(source.read(0, ALIGN))
+        if size != size_of(self.header):
+            raise ValueError("its size does not fit its header")
+        self._states = [self._state(at) for at in range(len(self.header.outputs))]
+        self._left = most
+        self.damaged = 0
+        """Messages that could not be read, at least."""
+        self.is_cut = False
+        """Whether there was more than `most`."""
+
+    @property
+    def states(self) -> list[State]:
+        """The states of all outputs when the reading began."""
+        return [state for state, _ in self._states]
+
+    def _state(self, at: int) -> tuple[State, bytes]:
+        for _ in range(_TRIES):
+            try:
+                return read_state(self._source, at)
+            except ValueError:
+                continue
+        return State(), b""
+
+    def messages(self) -> Iterator[Recorded]:
+        """All messages, in the order in which the recorder has received them."""
+        seen = set[int]()
+        tapes = (self._walk(at, state) for at, state in enumerate(self.states))
+        for output, head, position, crc in heapq.merge(*tapes, key=lambda one: one[1].number):
+            self._left -= head.size
+            if self._left < 0:
+                self.is_cut = True
+                return
+            if message := self._message(output, head, position, crc):
+                seen.add(output)
+                yield message
+            elif self._tail(output) <= position:
+                self.damaged += 1
+        for output in range(len(self._states)):
+            # All messages of an output that has few can have been replaced meanwhile.
+            if output not in seen and (message := self._newest(output)):
+                yield message
+
+    def _newest(self, at: int) -> Recorded | None:
+        for _ in range(_TRIES):
+            state, _schema = self._state(at)
+            for output, head, position, crc in self._walk(at, state):
+                if head.size > self._left:
+                    self.is_cut = True
+                    return None
+                if message := self._message(output, head, position, crc):
+                    self._left -= head.size
+                    return message
+        return None
+
+    def _walk(self, at: int, state: State) -> Iterator[tuple[int, RecordHead, int, int]]:
+        """The records of one tape, with their positions and CRCs."""
+        position, end = state.tail, state.head
+        if end - position > self.header.budget:
+            self.damaged += 1
+            return
+        while position < end:
+            data = read_tape(self._source, self.header, at, position, RECORD_SIZE)
+            try:
+                head, crc = parse_record(data, end - position)
+            except ValueError:
+                if (tail := self._tail(at)) > position:  # the recorder has given it up meanwhile
+                    position = tail
+                    continue
+                self.damaged += 1
+                return
+            yield at, head, position, crc
+            position += head.size
+
+    def _tail(self, at: int) -> int:
+        return self._state(at)[0].tail
+
+    def _message(self, at: int, head: RecordHead, position: int, crc: int) -> Recorded | None:
+        start = position + RECORD_SIZE
+        body = read_tape(self._source, self.header, at, start, head.body_size)
+        if format_record(head, [body])[4:8] != crc.to_bytes(4, "little"):
+            return None
+        schema, rest = body[: head.schema_size], memoryview(body)[head.schema_size :]
+        meta, data = bytes(rest[: head.meta_size]), bytes(rest[head.meta_size :])
+        return Recorded(at, head, schema or self._schema(at), meta, data)
+
+    def _schema(self, at: int) -> bytes:
+        """The schema of the state, which the recorder may have written after the first look."""
+        return self._states[at][1] or self._state(at)[1]
