@@ -7,6 +7,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.journal.reader import JournalReader, read_when_written
 from dora_systemd.decisions.cell.core_dumps import keeps_core_dumps
+from dora_systemd.decisions.cell.restarts import restart_of
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus, is_stopped
 from dora_systemd.decisions.life import node_table
 from dora_systemd.decisions.life.causes import NO_END
@@ -176,7 +177,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         {key: node.silent for key, node in nodes if node.silent},
         is_gathering=status.stage == GATHERING,
         stopped={key: node.asked_by for key, node in nodes if is_stopped(node)},
-        policy=cell.options.restart.policy,
+        policy=restart_of(cell.options).policy,
     )
 
 

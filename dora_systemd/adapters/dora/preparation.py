@@ -14,7 +14,6 @@ from dora_systemd.decisions.cell.launch import (
     launch_descriptor,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.restarts import check_restart_nodes
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,
     Dataflow,
@@ -78,8 +77,6 @@ def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
 
 
 def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
-    ids = [node.id for node in dataflow.nodes]
-    check_restart_nodes(options.node_restarts, ids)
     if options.settings:
         from dora_systemd.decisions.settings.runner import check_settings
 

@@ -15,8 +15,8 @@ from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owes import base_of, owes_of
-from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS
+from dora_systemd.decisions.cell.owes import base_of, owes_of, policies_of
+from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS, restart_of
 from dora_systemd.decisions.cell.uv import Read, find_lock, uv_project
 from dora_systemd.decisions.descriptor.dataflow import BuildSession, Dataflow
 from dora_systemd.decisions.descriptor.expansion import expanded
@@ -176,18 +176,18 @@ def _keys_of_kept(node: str, options: RunnerOptions) -> Mapping[str, Any]:
 
 def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
     """The restart keys of the node: from the settings for it, its own, or the dataflow's."""
-    for ident, policy in options.node_restarts:
-        if ident == node.id:
-            return policy.dora_keys()
+    if own := policies_of(options).get(node.id):
+        return own.dora_keys()
     if node.restart_policy:
         return _restart_bounds(node)
     # dora does not restart nodes made of operators, nor dynamic nodes.
     is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
-    policy = base_of(options.restart, owes_of(options), node.id)
+    policy = base_of(restart_of(options), owes_of(options), node.id)
     if not is_restarted or policy.policy == "no":
         return {}
-    own = node.backoff if options.restart.policy == "no" else {}  # it restarts by its owes alone
-    return {**policy.dora_keys(), **{key: own[key] for key in _BUDGET if key in own}}
+    # Without a policy of the dataflow it restarts by its owes alone.
+    kept = node.backoff if restart_of(options).policy == "no" else {}
+    return {**policy.dora_keys(), **{key: kept[key] for key in _BUDGET if key in kept}}
 
 
 def _restart_bounds(node: Node) -> dict[str, Any]:

@@ -13,14 +13,6 @@ from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.machines import Placed, parse_head, parse_machine, parse_placed
-from dora_systemd.decisions.cell.restarts import (
-    DEFAULT,
-    RestartPolicy,
-    format_node_policy,
-    format_policy,
-    parse_node_policy,
-    parse_policy,
-)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.values import (
@@ -48,6 +40,8 @@ MODULES = {
     "io_weight": "limits",
     "lock_memory": "rights",
     "log_rate_limit": "log_rates",
+    "max_restart_delay": "restarts",
+    "max_restarts": "restarts",
     "memory_high": "limits",
     "memory_limit": "limits",
     "needs": "needs",
@@ -55,6 +49,9 @@ MODULES = {
     "notify": "owes",
     "oom_score_adjust": "rights",
     "owes": "owes",
+    "restart_delay": "restarts",
+    "restart_policy": "restarts",
+    "restart_window": "restarts",
     "scheduling": "rights",
     "stop": "stops",
     "stop_limit": "stops",
@@ -92,8 +89,6 @@ class RunnerOptions(NamedTuple):
     # overrides the descriptor's key of that name, unless None
     exit_when_nodes_finish: bool | None = None
     env_keys: tuple[str, ...] = ()  # names of the variables that override the descriptor's `env:`
-    restart: RestartPolicy = DEFAULT  # policy of nodes without one in the descriptor
-    node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()  # policies of single nodes
     start_timeout: int = INFINITY  # µs for all nodes to become ready, or INFINITY
     reload: HotReload = DEFAULT_RELOAD  # files that cause a reload, and how nodes are replaced
     settings: tuple[SettingText, ...] = ()  # see dora_systemd.decisions.settings
@@ -242,10 +237,8 @@ _OPTIONS = (
     _always("grace-duration", "grace", parse_duration, format_duration),
     _unless_default("venv", "venv"),
     _unless_default("exit-when-nodes-finish", "exit_when_nodes_finish", parse_bool, format_bool),
-    _unless_default("restart", "restart", parse_policy, format_policy),
     _unless_default("start-timeout", "start_timeout", parse_duration, format_duration),
     _each("env-key", "env_keys"),
-    _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
     _each("set", "settings", parse_setting, format_setting),
     _each("placed", "placed", parse_placed, "=".join),
     _unless_default("machine", "machine", parse_machine),

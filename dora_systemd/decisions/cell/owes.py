@@ -8,7 +8,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.restarts import RestartPolicy
+from dora_systemd.decisions.cell.restarts import (
+    DEFAULT,
+    RestartPolicy,
+    given_policies,
+    with_values,
+)
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean
@@ -123,6 +128,14 @@ def base_of(policy: RestartPolicy, owes: Iterable[Owed], node: str) -> RestartPo
     """The policy of a node without one of its own, from that of the dataflow."""
     is_needed = policy.policy == "no" and owes_restart(owes, node)
     return policy._replace(policy="on-failure") if is_needed else policy
+
+
+@lru_cache(maxsize=4)
+def policies_of(options: RunnerOptions) -> Mapping[str, RestartPolicy]:
+    """The policies of single nodes. Raises DoraSystemdError."""
+    given, owes = given_policies(options), owes_of(options)
+    base = with_values(DEFAULT, given.pop("", {}))
+    return {node: with_values(base_of(base, owes, node), own) for node, own in given.items()}
 
 
 def is_probe(node: str) -> bool:

@@ -5,16 +5,16 @@ systemd.service(5), systemd.unit(5) and dora's descriptor.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import check_known
 from dora_systemd.values import (
     INFINITY,
     SECOND,
     format_duration,
-    format_number,
     parse_duration,
     quoted,
 )
@@ -99,39 +99,22 @@ LATCH_KEYS: Mapping[str, Any] = {
 by itself, and dora can replace it within this delay. If nothing is missing, the launcher fails in
 the place of the node, and dora gives the node up."""
 
-_KEYS = ("max", "window", "delay", "max-delay")
 
-
-def format_policy(policy: RestartPolicy) -> str:
-    """The policy in the runner's command line, such as `on-failure,max=5,window=10min,...`."""
-    maximum = format_number(policy.max_restarts)
-    times = (format_duration(one) for one in (policy.window, policy.delay, policy.max_delay))
-    pairs = zip(_KEYS, (maximum, *times), strict=True)
-    return ",".join([policy.policy, *(f"{key}={text}" for key, text in pairs)])
-
-
-def parse_policy(text: str) -> RestartPolicy:
-    """The exact inverse of format_policy. Raises DoraSystemdError (USAGE)."""
-    word, *pairs = text.split(",")
-    given = dict(pair.split("=", 1) for pair in pairs if "=" in pair)
-    if word not in POLICIES or given.keys() != set(_KEYS):
-        message = f"cannot use {quoted(text)} as restart policy"
+def parse_choice(text: str) -> str:
+    """The word of a policy. Raises DoraSystemdError (USAGE)."""
+    if (word := text.strip()) not in POLICIES:
+        message = f"cannot use {quoted(word)} as restart policy"
         raise DoraSystemdError(message, f"valid values: {', '.join(POLICIES)}", ExitCode.USAGE)
-    times = (parse_duration(given[key]) for key in _KEYS[1:])
-    return RestartPolicy(word, parse_count(given["max"]), *times)
+    return word
 
 
-def format_node_policy(of_node: tuple[str, RestartPolicy]) -> str:
-    """The policy of one node in the runner's command line, NODE:POLICY."""
-    node, policy = of_node
-    return f"{node}:{format_policy(policy)}"
-
-
-def parse_node_policy(text: str) -> tuple[str, RestartPolicy]:
-    """The exact inverse of format_node_policy. Raises DoraSystemdError (USAGE)."""
-    # Policies contain no colon, but node ids may contain one.
-    node, _, policy = text.rpartition(":")
-    return node, parse_policy(policy)
+def parse_window(text: str) -> int:
+    """µs after which something is reset or given up. Raises DoraSystemdError (USAGE)."""
+    window = parse_duration(text)
+    if window == 0:
+        message = f"cannot use {quoted(text)} as the window of restarts"
+        raise DoraSystemdError(message, "write a time such as 10min", ExitCode.USAGE)
+    return window
 
 
 def parse_count(text: str) -> int:
@@ -163,11 +146,34 @@ def with_values(base: RestartPolicy, values: Mapping[str, Any]) -> RestartPolicy
     return changed._replace(max_delay=max(changed.max_delay, changed.delay))
 
 
-def check_restart_nodes(
-    policies: Iterable[tuple[str, RestartPolicy]], nodes: Sequence[str]
-) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for the policy of a node that is not in `nodes`."""
-    check_known("cannot set the restart policy of", dict(policies), nodes)
+_PARSERS: Sequence[Callable[[str], Any]] = (
+    *(parse_choice, parse_count, parse_window, parse_delay, parse_delay),
+)
+POLICY_KEYS = (
+    *("restart_policy", "max_restarts", "restart_window", "restart_delay", "max_restart_delay"),
+)
+"""The settings of a RestartPolicy, in the order of its fields."""
+_FIELDS = dict(zip(POLICY_KEYS, zip(RestartPolicy._fields, _PARSERS, strict=True), strict=True))
+
+
+@lru_cache(maxsize=4)
+def restart_of(options: RunnerOptions) -> RestartPolicy:
+    """The policy of the dataflow, and of nodes without one in the descriptor.
+
+    Imports no module of settings: it is read before the coordinator starts. Raises
+    DoraSystemdError.
+    """
+    return with_values(DEFAULT, given_policies(options).get("", {}))
+
+
+def given_policies(options: RunnerOptions) -> dict[str, dict[str, Any]]:
+    """The given fields of policies by node, "" for the dataflow. Raises DoraSystemdError."""
+    found: dict[str, dict[str, Any]] = {}
+    for node, key, text in options.settings:
+        if key in _FIELDS:
+            field, parse = _FIELDS[key]
+            found.setdefault(node, {})[field] = parse(text)
+    return found
 
 
 def budget_words(budget: Mapping[str, int | None]) -> str:

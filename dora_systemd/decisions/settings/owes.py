@@ -14,6 +14,7 @@ from dora_systemd.decisions.cell.owes import (
     owed_of,
     owes_of,
     parse_owed,
+    policies_of,
 )
 from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.settings.kinds import (
@@ -52,7 +53,7 @@ def _parse_one(value: Any) -> Owed:
 
 
 def _check(options: RunnerOptions, nodes: Sequence[Node]) -> None:
-    check_owes(owes_of(options), dict(options.node_restarts), nodes)
+    check_owes(owes_of(options), policies_of(options), nodes)
 
 
 def _by_node(

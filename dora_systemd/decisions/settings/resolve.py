@@ -17,13 +17,12 @@ from dora_systemd.decisions.cell.options import (
     changed,
     parse_setting,
 )
-from dora_systemd.decisions.cell.owes import RESTART, base_of
-from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
+from dora_systemd.decisions.cell.owes import RESTART
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
 from dora_systemd.decisions.settings.on_failure import ON_FAILURE
-from dora_systemd.decisions.settings.owes import OWES, merged_owes
+from dora_systemd.decisions.settings.owes import OWES
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
 from dora_systemd.decisions.settings.table import (
@@ -221,12 +220,6 @@ def _resolve_nodes(
     return nodes
 
 
-_FIELDS = {
-    setting.name: field
-    for setting, field in zip(POLICY_SETTINGS, RestartPolicy._fields, strict=True)
-}
-
-
 def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
     """The options, with those that are settings. Raises DoraSystemdError."""
     return options._replace(
@@ -235,8 +228,6 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         allow_shell_nodes=settings[ALLOW_SHELL_NODES],
         grace=settings[GRACE_DURATION],
         exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
-        restart=restart_policy(settings),
-        node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
         reload=hot_reload(settings, options.working_directory),
         settings=changed(tuple(runner_texts(settings)), settings.passed),
@@ -265,21 +256,6 @@ def _by_node(settings: Settings) -> dict[str, dict[str, Any]]:
         elif setting.name in MODULES and not setting.property and settings.is_given(setting):
             found[""][setting.name] = settings[setting]
     return found
-
-
-def restart_policy(settings: Settings) -> RestartPolicy:
-    """The policy of the dataflow, and of its nodes without one."""
-    return with_values(DEFAULT, {_FIELDS[one.name]: settings[one] for one in POLICY_SETTINGS})
-
-
-def node_policies(settings: Settings) -> tuple[tuple[str, RestartPolicy], ...]:
-    """The policies of nodes in settings files, based on that of the dataflow."""
-    base, owes = restart_policy(settings), merged_owes(settings.by_node(OWES), settings[OWES])
-    return tuple(
-        (node, with_values(base_of(base, owes, node), {_FIELDS[key]: values[key] for key in given}))
-        for node, values in settings.nodes.items()
-        if (given := values.keys() & _FIELDS)
-    )
 
 
 def hot_reload(settings: Settings, root: str) -> HotReload:

@@ -15,6 +15,7 @@ from dora_systemd.decisions.cell.options import (
     reload_command,
     runner_command,
 )
+from dora_systemd.decisions.cell.restarts import restart_of
 from dora_systemd.decisions.cell.rights import NICE_LIMIT, NodeRights, rights_of
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.life.stop_budget import unit_timeout
@@ -116,7 +117,7 @@ def format_unit(properties: Properties) -> str:
 
 def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
     """The runner as the main process of a Type=notify service, see systemd.service(5)."""
-    pause = 0 if options.restart.policy == "no" else options.restart.max_delay
+    pause = 0 if restart_of(options).policy == "no" else restart_of(options).max_delay
     # The runner reports late nodes itself; systemd's timeout is for a runner that hangs.
     most = min(pause + options.start_timeout + START_MARGIN, INFINITY)
     return typed(
@@ -155,7 +156,7 @@ def stop_properties(options: RunnerOptions) -> dict[str, Property]:
 
 def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     """Automatic restarts, see systemd.service(5) and StartLimitBurst= in systemd.unit(5)."""
-    policy = options.restart
+    policy = restart_of(options)
     # A restart does not help nodes that dora gave up, or a dataflow that is refused. An attached
     # dataflow that has finished stays finished.
     refused = (RunnerExit.BAD_DATAFLOW, RunnerExit.NO_ACCESS, RunnerExit.NO_DORA)

@@ -22,7 +22,12 @@ from pathlib import Path
 
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.restarts import HEAD_START, RestartPolicy, count_restarts
+from dora_systemd.decisions.cell.restarts import (
+    HEAD_START,
+    RestartPolicy,
+    count_restarts,
+    restart_of,
+)
 from dora_systemd.errors import DoraSystemdError, RestartsSpent
 from dora_systemd.names import unit_name
 from dora_systemd.paths import CellPaths, request_file
@@ -38,7 +43,7 @@ def pause(options: RunnerOptions, paths: CellPaths) -> None:
 
     Raises OSError, and RestartsSpent if this restart exceeds the budget.
     """
-    policy = options.restart
+    policy = restart_of(options)
     if policy.policy == "no":
         return
     if spent := find_spent(options, paths):
@@ -66,7 +71,7 @@ def report_last_life(options: RunnerOptions, environment: Mapping[str, str]) -> 
 
 def find_spent(options: RunnerOptions, paths: CellPaths) -> RestartsSpent | None:
     """Return the error of a restart that exceeds the budget of restarts, or None."""
-    policy, lives = options.restart, fd_store.lives()
+    policy, lives = restart_of(options), fd_store.lives()
     if policy.policy == "no" or lives <= policy.max_restarts:
         return None
     lives = min(lives, asked("NRestarts", options.name, paths.is_of_user, lives))
@@ -96,7 +101,7 @@ def hold_back(options: RunnerOptions, paths: CellPaths, old: float | None = None
         # systemd's timers are up to 250 ms late, and the delay begins before ExecStopPost=.
         ended = asked("ActiveExitTimestampMonotonic", options.name, paths.is_of_user, 0)
         since = time.clock_gettime(time.CLOCK_MONOTONIC) - ended / SECOND
-        delay = options.restart.delay / SECOND
+        delay = restart_of(options).delay / SECOND
         # After more than that it was another life, and the last one never became active.
         known = delay - since if since < delay + _MOST_SECONDS else seconds
         time.sleep(max(min(seconds, known), 0))
@@ -140,11 +145,12 @@ async def forget_restarts(options: RunnerOptions) -> None:
     """Reset the delay after a quiet window."""
     import asyncio
 
-    if options.restart.policy != "no" and options.restart.window != INFINITY:
-        await asyncio.sleep(options.restart.window / SECOND)
+    policy = restart_of(options)
+    if policy.policy != "no" and policy.window != INFINITY:
+        await asyncio.sleep(policy.window / SECOND)
         fd_store.forget_lives()
         # The window of this life is over: its next restart begins another one.
-        fd_store.count_life(_now_us() - options.restart.window)
+        fd_store.count_life(_now_us() - policy.window)
 
 
 _TICK = SECOND // os.sysconf("SC_CLK_TCK")
@@ -197,7 +203,7 @@ class Life:
 
 def begin_life(options: RunnerOptions, is_user: bool) -> Life:
     """Return the life that begins with this process."""
-    is_first = is_first_life(options.restart, options.name, is_user)
+    is_first = is_first_life(restart_of(options), options.name, is_user)
     return Life(options.uuid, is_first, not is_first and fd_store.is_first_life())
 
 

@@ -23,6 +23,7 @@ from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import format_missing, members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.restarts import restart_of
 from dora_systemd.decisions.cell.rights import is_essential, rights_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
@@ -147,7 +148,7 @@ class Head(Shared):
             nodes=nodes,
             members=self.roster.names,
             lost=self.roster.lost,
-            waits_for_lost=self.options.restart.policy != "no",
+            waits_for_lost=restart_of(self.options).policy != "no",
         )
 
     def definition(self, node: Mapping[str, Any]) -> Mapping[str, Any]:

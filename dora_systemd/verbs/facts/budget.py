@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import SETTLED, Manager
-from dora_systemd.decisions.cell.restarts import unit_budget
+from dora_systemd.decisions.cell.restarts import restart_of, unit_budget
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.views.dataflows import RESTARTING
@@ -36,7 +36,7 @@ def restart_budget(
     if window in (0, INFINITY):
         return None
     # systemd's limit has room for starts by hand; a drop-in can make it smaller.
-    most = max(min(facts["StartLimitBurst"] - 1, cell.options.restart.max_restarts), 0)
+    most = max(min(facts["StartLimitBurst"] - 1, restart_of(cell.options).max_restarts), 0)
     budget = unit_budget(
         _starts(scope, cell.name, facts["NRestarts"], (cell.uuid, cell.state, facts[_READY_SINCE])),
         most,
@@ -79,7 +79,7 @@ def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
         return max(status.started_us - time.time_ns() // 1000, 0)
     facts: dict[str, Any] = manager.read(cell.unit, _WAITING)
     now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-    policy = cell.options.restart
+    policy = restart_of(cell.options)
     delay = max(int(facts["RestartUSec"]), 0 if policy.policy == "no" else policy.delay)
     return max(int(facts["StateChangeTimestampMonotonic"]) + delay - now, 0)
 

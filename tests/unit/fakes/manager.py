@@ -15,10 +15,12 @@ from dora_systemd.decisions.cell.options import (
     runner_command,
 )
 from dora_systemd.decisions.cell.owes import Owed, format_owed
+from dora_systemd.decisions.cell.restarts import POLICY_KEYS, RestartPolicy
 from dora_systemd.decisions.cell.rights import BY_KEY, NodeRights, given_rights
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_description, unit_name
 from dora_systemd.scope import Scope
+from dora_systemd.values import format_duration, format_number
 
 
 class ScopeIn(Scope):
@@ -68,6 +70,16 @@ def with_owes(options: RunnerOptions, *owes: Owed) -> RunnerOptions:
         options,
         (SettingText(one.node, "owes", format_owed(one._replace(node=""))) for one in owes),
     )
+
+
+def with_restart(options: RunnerOptions, policy: RestartPolicy, node: str = "") -> RunnerOptions:
+    texts = (
+        policy.policy,
+        format_number(policy.max_restarts),
+        *map(format_duration, (policy.window, policy.delay, policy.max_delay)),
+    )
+    given = zip(POLICY_KEYS, texts, strict=True)
+    return _with(options, (SettingText(node, *one) for one in given))
 
 
 def _with(options: RunnerOptions, texts: Iterable[SettingText]) -> RunnerOptions:

@@ -25,7 +25,7 @@ from dora_systemd.verbs.stop import (
 )
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.library import fake_journalctl
-from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options, with_restart
 
 UNIT = "dora-robot.service"
 
@@ -208,7 +208,7 @@ def test_the_end_of_the_shortest_delay_is_the_runners() -> None:
     policy = RestartPolicy("on-failure", delay=60 * SECOND)
     now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
     manager.add(
-        options(restart=policy),
+        with_restart(options(), policy),
         active="activating",
         SubState="auto-restart",
         NRestarts=0,

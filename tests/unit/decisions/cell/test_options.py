@@ -21,7 +21,6 @@ from dora_systemd.decisions.cell.options import (
     runner_command,
 )
 from dora_systemd.decisions.cell.owes import SHORTEST as SHORTEST_TIME
-from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 
@@ -33,14 +32,6 @@ paths = texts.map(lambda text: "/" + text)
 idents = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 nodes = st.just(ALL_NODES) | idents
 times = st.integers(1, 10**12)
-policies = st.builds(
-    RestartPolicy,
-    st.sampled_from(POLICIES),
-    st.integers(1, 1_000_000) | st.just(INFINITY),
-    times | st.just(INFINITY),
-    times,
-    times,
-)
 outputs = st.from_regex(r"[a-z][a-z0-9_/:.-]{0,20}", fullmatch=True)
 spans = st.integers(SHORTEST_TIME, 10**12)
 given_settings = st.builds(SettingText, st.just("") | idents, st.sampled_from([*MODULES]), texts)
@@ -67,8 +58,6 @@ options = st.builds(
     attached=st.booleans(),
     exit_when_nodes_finish=st.none() | st.booleans(),
     env_keys=st.lists(texts).map(tuple),
-    restart=policies,
-    node_restarts=st.lists(st.tuples(st.text(min_size=1), policies)).map(tuple),
     start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
     reload=st.builds(
         HotReload,
@@ -97,8 +86,6 @@ ALL = RunnerOptions(
     attached=True,
     exit_when_nodes_finish=False,
     env_keys=("MODEL", "RATE"),
-    restart=RestartPolicy("on-failure"),
-    node_restarts=(("a:b", RestartPolicy("always", INFINITY, INFINITY, SECOND, SECOND)),),
     start_timeout=90 * SECOND,
     reload=HotReload(
         True, ("*.py", "a=b"), ("tmp_*",), (("camera", "x=y"),), (("", "start-first"), ("a", "b"))
@@ -106,17 +93,18 @@ ALL = RunnerOptions(
     settings=(
         SettingText("camera", "nice", "5"),
         SettingText("camera", "owes", "/image:within=2s,first=1min 30s,then=warn"),
+        SettingText("", "restart_policy", "on-failure"),
+        SettingText("a:b", "max_restarts", "infinity"),
         SettingText("", "stop_limit", "1h"),
     ),
 )
 ARGUMENTS = f"""\
 --name=robot --uuid={UUID} --working-directory=/srv --dora=/usr/bin/dora --grace-duration=5s
 --venv=/srv/venv --exit-when-nodes-finish=no
---restart=on-failure,max=5,window=10min,delay=500ms,max-delay=30s '--start-timeout=1min 30s'
+'--start-timeout=1min 30s'
 --env-key=MODEL --env-key=RATE
---node-restart=a:b:always,max=infinity,window=infinity,delay=1s,max-delay=1s
 --set=camera:nice=5 '--set=camera:owes=/image:within=2s,first=1min 30s,then=warn'
---set=stop_limit=1h
+--set=restart_policy=on-failure --set=a:b:max_restarts=infinity --set=stop_limit=1h
 --watch=*.py --watch=a=b --ignore=tmp_* --node-watch=camera=x=y --replace==start-first --replace=a=b
 --uv --debug --allow-shell-nodes --attached --hot-reload /srv/robot.yml
 """
@@ -171,7 +159,9 @@ def test_other_commands_are_no_runners() -> None:
         options_from_command(["/usr/bin/python3", "-m", "http.server"])
 
 
-@pytest.mark.parametrize("unknown", ["--colour=red", "--colour", "--restart=often", "--uv=yes"])
+@pytest.mark.parametrize(
+    "unknown", ["--colour=red", "--colour", "--start-timeout=often", "--uv=yes"]
+)
 def test_options_of_another_version_are_left_out(unknown: str) -> None:
     command = runner_command("/usr/bin/python3", OPTIONS)
     command.insert(-1, unknown)

@@ -6,26 +6,27 @@ import pytest
 
 from dora_systemd.decisions.cell.launch import launch_descriptor
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owes import policies_of
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
     Budget,
     RestartPolicy,
     budget_words,
-    check_restart_nodes,
+    restart_of,
     unit_budget,
 )
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.settings.resolve import (
     Settings,
     idle_warnings,
-    node_policies,
     resolve_settings,
-    restart_policy,
+    with_settings,
 )
 from dora_systemd.decisions.unit.properties import restart_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.decisions.cell.test_launch import plan
+from tests.unit.fakes.manager import options, with_restart
 
 MINUTE = 60 * SECOND
 POLICY = RestartPolicy("on-failure", 3, 10 * MINUTE, SECOND, 8 * SECOND)
@@ -35,14 +36,18 @@ def settings(flags: dict[str, object], document: object = None) -> Settings:
     return resolve_settings(flags, {}, [("robot.systemd.yml", document)])
 
 
+def runner(given: Settings) -> RunnerOptions:
+    return with_settings(options(), given)
+
+
 def test_from_settings() -> None:
     given = settings(
         {"restart_policy": "on-failure", "restart_delay": "40s"},
         {"max_restarts": 3, "nodes": {"camera": {"restart_policy": "always"}, "plot": None}},
     )
     expected = RestartPolicy("on-failure", 3, DEFAULT.window, 40 * SECOND, 40 * SECOND)
-    assert restart_policy(given) == expected
-    assert node_policies(given) == (("camera", expected._replace(policy="always")),)
+    assert restart_of(runner(given)) == expected
+    assert policies_of(runner(given)) == {"camera": expected._replace(policy="always")}
 
 
 OWES = {"output": "image", "within": "2s"}
@@ -60,7 +65,7 @@ OWES = {"output": "image", "within": "2s"}
 )
 def test_a_budget_without_a_policy(node: dict[str, object], policy: str) -> None:
     given = settings({}, {"nodes": {"camera": node}})
-    assert node_policies(given) == (("camera", DEFAULT._replace(policy=policy, max_restarts=2)),)
+    assert policies_of(runner(given)) == {"camera": DEFAULT._replace(policy=policy, max_restarts=2)}
 
 
 def test_a_budget_of_what_a_node_owes_has_an_effect() -> None:
@@ -69,9 +74,9 @@ def test_a_budget_of_what_a_node_owes_has_an_effect() -> None:
 
 
 def test_default_restarts_nothing() -> None:
-    assert restart_policy(settings({})).policy == "no"
+    assert restart_of(runner(settings({}))).policy == "no"
     # A bare `no` is false in YAML.
-    assert restart_policy(settings({}, {"restart_policy": False})).policy == "no"
+    assert restart_of(runner(settings({}, {"restart_policy": False}))).policy == "no"
 
 
 def test_warnings() -> None:
@@ -113,15 +118,11 @@ def test_bad_values(name: str, text: str) -> None:
     assert caught.value.hint
 
 
-def test_unknown_node() -> None:
-    with pytest.raises(DoraSystemdError) as caught:
-        check_restart_nodes([("camra", POLICY)], ["camera", "plot"])
-    assert caught.value.hint == "did you mean camera?"
-
-
-def node(raw: dict[str, Any], **options: Any) -> dict[str, Any]:
+def node(raw: dict[str, Any], policy: RestartPolicy = DEFAULT, ident: str = "") -> dict[str, Any]:
+    """The keys of the node `n`. policy: of the node `ident`, or of the dataflow."""
     flow = parse_dataflow({"nodes": [{"id": "n", "path": "a.py", **raw}]}, "flow.yml")
-    launched: dict[str, Any] = launch_descriptor(flow, plan(**options))["nodes"][0]
+    given = plan(settings=with_restart(options(), policy, ident).settings)
+    launched: dict[str, Any] = launch_descriptor(flow, given)["nodes"][0]
     return {key: launched[key] for key in launched if "restart" in key}
 
 
@@ -136,14 +137,14 @@ DORA = {
 
 def test_nodes_that_state_nothing_get_the_policy() -> None:
     assert node({}) == {}
-    assert node({}, restart=POLICY) == DORA
-    assert node({"restart_policy": "never"}, restart=POLICY) == {"restart_policy": "never"}
+    assert node({}, POLICY) == DORA
+    assert node({"restart_policy": "never"}, POLICY) == {"restart_policy": "never"}
 
 
 def test_the_settings_of_a_node_win() -> None:
     given = {"restart_policy": "always", "max_restarts": 9}
-    assert node(given, node_restarts=(("n", POLICY),)) == DORA
-    assert node(given, node_restarts=(("n", DEFAULT),))["restart_policy"] == "never"
+    assert node(given, POLICY, "n") == DORA
+    assert node(given, DEFAULT, "n")["restart_policy"] == "never"
 
 
 def test_endless() -> None:
@@ -153,8 +154,8 @@ def test_endless() -> None:
 
 
 def unit(policy: RestartPolicy, **changes: Any) -> dict[str, Any]:
-    options = RunnerOptions("r", "u", "/f.yml", "/", "/dora", restart=policy, **changes)
-    return {key: one.value for key, one in restart_properties(options).items()}
+    given = with_restart(options(**changes), policy)
+    return {key: one.value for key, one in restart_properties(given).items()}
 
 
 def test_systemd_counts_what_the_runner_does_not() -> None:

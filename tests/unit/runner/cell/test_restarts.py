@@ -38,7 +38,7 @@ from dora_systemd.runner.cell.restarts import (
 )
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.loop import live
-from tests.unit.fakes.manager import options
+from tests.unit.fakes.manager import options, with_restart
 from tests.unit.fakes.programs import make_program
 
 DELAY = SECOND // 2
@@ -116,7 +116,7 @@ class Unit:
         return self.slept
 
     def options(self, policy: RestartPolicy) -> RunnerOptions:
-        return RunnerOptions("robot", "uuid", "/f.yml", "/", "/dora", restart=policy)
+        return with_restart(options(uuid="uuid"), policy)
 
 
 @pytest.fixture
@@ -400,7 +400,7 @@ def learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Learn:
     def learn(name: str, restarts: int) -> tuple[bool, list[str]]:
         asked.write_text("")
         make_program(tmp_path / "systemctl", f'echo "$@" >> {asked}; echo {restarts}')
-        begun = begin_life(options(name, restart=ON_FAILURE), is_user=True)
+        begun = begin_life(with_restart(options(name), ON_FAILURE), is_user=True)
         asyncio.run(learn_first(begun, name, is_user=True, seconds=0.0))
         return begun.is_first, asked.read_text().splitlines()
 
@@ -445,7 +445,7 @@ def test_only_a_start_that_was_just_queued_is_the_first(
 
 
 def test_a_life(monkeypatch: pytest.MonkeyPatch, unit_file: Path) -> None:
-    begun = begin_life(options("robot", restart=ON_FAILURE), is_user=True)
+    begun = begin_life(with_restart(options("robot"), ON_FAILURE), is_user=True)
     assert (begun.uuid, begun.is_first, begun.may_be_first) == (options().uuid, True, False)
     assert begun.up_us == 0
     begun.become_up()
@@ -454,10 +454,10 @@ def test_a_life(monkeypatch: pytest.MonkeyPatch, unit_file: Path) -> None:
     begun.become_up()
     assert begun.up_us == first
     unit_file.unlink()
-    later = begin_life(options("robot", restart=ON_FAILURE), is_user=True)
+    later = begin_life(with_restart(options("robot"), ON_FAILURE), is_user=True)
     assert (later.is_first, later.may_be_first) == (False, True), "systemd knows"
     monkeypatch.setenv("LISTEN_FDNAMES", "dora-life")
-    later = begin_life(options("robot", restart=ON_FAILURE), is_user=True)
+    later = begin_life(with_restart(options("robot"), ON_FAILURE), is_user=True)
     assert (later.is_first, later.may_be_first) == (False, False)
     plain = Life("uuid")
     assert (plain.is_first, plain.may_be_first) == (False, False)
