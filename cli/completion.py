@@ -19,9 +19,9 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.cli.group import SHOWN, VerbGroup, doractl
 from dora_systemd.cli.parameters import current_scope, is_elsewhere
-from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.restarts import POLICIES
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
+from dora_systemd.decisions.reload.changes import REPLACE_WORDS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_uuid_prefix
 

@@ -29,7 +29,7 @@ def check_start(
     """
     check = DoraCheck(options, environment)
     prepared = check.beside(lambda: prepare(options, environment))
-    check_first(own, prepared.dataflow)
+    check_first(own)
     return check, prepared
 
 

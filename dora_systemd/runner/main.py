@@ -296,7 +296,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
 def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:
     """Read the dataflow for the first run. Raises DoraSystemdError if it is refused."""
     prepared = runs.check.beside(lambda: prepare(options, runs.environment))
-    check_first(runs.role.own(options), prepared.dataflow)
+    check_first(runs.role.own(options))
     return prepared
 
 

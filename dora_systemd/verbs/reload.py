@@ -1,13 +1,13 @@
 """`doractl reload`, and parts of `doractl set`: requests to the runner of a dataflow."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import (
-    HOT_RELOAD_FILE,
+    SET_FILE,
     drop_in_directory,
     put_unit_file,
     read_unit_file,
@@ -15,9 +15,9 @@ from dora_systemd.adapters.host.unit_files import (
     write_unit_file,
 )
 from dora_systemd.adapters.runner_socket.client import done_of, order
-from dora_systemd.decisions.cell.environment import with_changes
-from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
+from dora_systemd.decisions.cell.environment import changes_entry, changes_of, with_changes
 from dora_systemd.decisions.cell.line_rates import RateLimits, format_rates, rates_of
+from dora_systemd.decisions.cell.options import SettingText, changed
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -59,25 +59,30 @@ def switch_hot_reload(
         from dora_systemd.adapters.host.watch import require_watcher
 
         require_watcher()
-    unit = manager.read(cell.unit, ("FragmentPath", "Transient"))
+    unit = manager.read(cell.unit, ("Environment", "FragmentPath", "Transient"))
     with ExitStack() as undo:
-        remember(unit, HOT_RELOAD_FILE, f"{CHANGE_VARIABLE}={format_bool(is_on)}", undo)
+        remember(unit, [SettingText("", "hot_reload", format_bool(is_on))], undo)
         manager.reload()
         ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
         undo.pop_all()
 
 
-def remember(unit: Mapping[str, Any], name: str, assignment: str, undo: ExitStack) -> None:
-    """Write a drop-in `name`. Once systemd has loaded it, the next runner gets the change.
+def remember(unit: Mapping[str, Any], changes: Iterable[SettingText], undo: ExitStack) -> None:
+    """Add changes to our drop-in. Once systemd has loaded it, the next runner gets the changes.
 
-    assignment: of an environment variable. undo: gets what restores the file. Raises
-    DoraSystemdError.
+    undo: gets what restores the file. Raises DoraSystemdError.
     """
-    text = format_unit(typed(Environment=(assignment,)))
+    every = changed(changes_of(variables_of(unit)), changes)
+    text = format_unit(typed(Environment=(changes_entry(every),)))
     directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
-    path = directory / name
+    path = directory / SET_FILE
     undo.callback(_put_back, path, read_unit_file(path))
     write_unit_file(path, f"# Written by doractl set.\n{text}")
+
+
+def variables_of(unit: Mapping[str, Any]) -> dict[str, str]:
+    """The variables in Environment= of a unit."""
+    return dict(entry.partition("=")[::2] for entry in unit["Environment"] or ())
 
 
 def _put_back(path: Path, text: str | None) -> None:

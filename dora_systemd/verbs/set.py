@@ -14,13 +14,10 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.limits import limit_groups
-from dora_systemd.adapters.host.unit_files import SET_FILE
 from dora_systemd.adapters.runner_socket.client import order
 from dora_systemd.decisions.cell import line_rates
-from dora_systemd.decisions.cell.environment import changes_entry, changes_of
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, check_nodes
 from dora_systemd.decisions.cell.machines import members_of
-from dora_systemd.decisions.cell.options import changed
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.settings.limit_checks import check_cpus, check_use, size_warnings
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
@@ -34,7 +31,7 @@ from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
-from dora_systemd.verbs.reload import Ask, limit_lines, remember
+from dora_systemd.verbs.reload import Ask, limit_lines, remember, variables_of
 from dora_systemd.verbs.start.limits import read_machine, require_controllers
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
@@ -69,7 +66,6 @@ def set_limits(
     check_cpus(nodes, read_machine())
     require_controllers(manager, scope, properties, nodes)
     unit = manager.read(cell.unit, _PROPERTIES)
-    before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
     values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}
     warnings = (*size_warnings(values, nodes, read_machine()), *_placed_warnings(cell, rates))
     if unit["ControlGroup"] and not is_forced:
@@ -81,10 +77,9 @@ def set_limits(
     with ExitStack() as undo:
         _limit_groups(unit, nodes, undo)
         if nodes or rates:
-            changes = changed(changes_of(before), runner_texts(settings))
-            remember(unit, SET_FILE, changes_entry(changes), undo)
+            remember(unit, runner_texts(settings), undo)
         if rates and unit["ControlGroup"]:
-            limit_lines(scope, cell, before, rates, undo, ask)
+            limit_lines(scope, cell, variables_of(unit), rates, undo, ask)
         if properties:
             manager.set_properties(cell.unit, list(properties.values()), is_fleeting)
         if nodes or rates:

@@ -8,7 +8,6 @@ from typing import Any
 
 from dora_systemd.adapters.dora.command import refusal_reason, run_dora
 from dora_systemd.adapters.host import files
-from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
 from dora_systemd.decisions.cell.launch import (
     LaunchPlan,
     launch_descriptor,
@@ -44,7 +43,7 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     Raises DoraSystemdError if it is not readable or a node of it cannot run.
     """
     dataflow = load_dataflow(options)
-    _check_limited(options, dataflow)
+    check_named_nodes(options, dataflow)
     if options.machine:
         from dora_systemd.decisions.machines.part import own_dataflow
 
@@ -67,16 +66,10 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
 
 
 def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) if the options name a node that does not exist.
+    """Raise DoraSystemdError (BAD_INPUT) for a node that does not exist, or cannot have a setting.
 
     dataflow: with modules expanded.
     """
-    _check_limited(options, dataflow)
-    ids = [node.id for node in dataflow.nodes]
-    check_reload_nodes(options.reload, ids)
-
-
-def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     if options.settings:
         from dora_systemd.decisions.settings.runner import check_settings
 

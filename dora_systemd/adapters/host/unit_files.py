@@ -114,8 +114,7 @@ def put_unit_file(path: Path, text: str | None) -> None:
 
 
 SET_FILE = "60-set.conf"
-HOT_RELOAD_FILE = "60-hot-reload.conf"
-_CHANGES = ("50-*.conf", SET_FILE, HOT_RELOAD_FILE)
+_CHANGES = ("50-*.conf", SET_FILE)
 """systemd's own drop-ins for changed properties, and ours for what only the runner knows."""
 
 

@@ -69,10 +69,10 @@ class Since(NamedTuple):
 
 def watch_rules(options: RunnerOptions) -> WatchRules:
     """The rules for files that cause a reload; reads the .gitignore files now."""
-    root, given = options.working_directory, options.reload
+    root = options.working_directory
     own = frozenset({options.dataflow, settings_path(options.dataflow)})
-    watched = given.watch or DEFAULT_WATCH
-    return WatchRules(root, watched, given.ignore, read_gitignores(root), own)
+    watched = options.of_dataflow("watch") or DEFAULT_WATCH
+    return WatchRules(root, watched, options.of_dataflow("ignore"), read_gitignores(root), own)
 
 
 async def changed_files(

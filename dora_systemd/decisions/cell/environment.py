@@ -5,7 +5,6 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PurePath
 
-from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     SettingText,
@@ -16,7 +15,7 @@ from dora_systemd.decisions.cell.options import (
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_readable
 from dora_systemd.paths import CellPaths, own_directory
-from dora_systemd.values import format_bool, parse_bool, quoted
+from dora_systemd.values import quoted
 
 MAX_ENTRY = 128 * 1024 - 1
 """Maximum bytes of one `KEY=VALUE`: execve(2) refuses a longer one (MAX_ARG_STRLEN) with its NUL.
@@ -33,7 +32,7 @@ MANAGER_VARIABLES = frozenset(
         *("NOTIFY_SOCKET", "JOURNAL_STREAM", "INVOCATION_ID", "SYSTEMD_EXEC_PID", "MAINPID"),
         *("MANAGERPID", "MANAGERPIDFDID", "WATCHDOG_PID", "WATCHDOG_USEC", "RUNTIME_DIRECTORY"),
         *("LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "LISTEN_PIDFDID", "FDSTORE"),
-        *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGE_VARIABLE),
+        *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE"),
         SET_VARIABLE,
         LOCK_VARIABLE,
     }
@@ -67,11 +66,7 @@ def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> Runn
 
     Raises DoraSystemdError for variables that `doractl set` cannot have written.
     """
-    is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
-    return options._replace(
-        reload=options.reload._replace(is_on=is_on),
-        settings=changed(options.settings, changes_of(environment)),
-    )
+    return options._replace(settings=changed(options.settings, changes_of(environment)))
 
 
 def changes_of(environment: Mapping[str, str]) -> tuple[SettingText, ...]:

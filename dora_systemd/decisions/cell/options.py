@@ -7,11 +7,9 @@ module imports only what loads quickly.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib import import_module
-from operator import attrgetter
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.machines import Placed, parse_head, parse_machine, parse_placed
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
@@ -37,6 +35,8 @@ MODULES = {
     "cpu_weight": "limits",
     "cpus": "limits",
     "essential": "rights",
+    "hot_reload": "reload",
+    "ignore": "reload",
     "io_weight": "limits",
     "lock_memory": "rights",
     "log_rate_limit": "log_rates",
@@ -49,6 +49,7 @@ MODULES = {
     "notify": "owes",
     "oom_score_adjust": "rights",
     "owes": "owes",
+    "replace": "reload",
     "restart_delay": "restarts",
     "restart_policy": "restarts",
     "restart_window": "restarts",
@@ -57,6 +58,7 @@ MODULES = {
     "stop_limit": "stops",
     "swap_limit": "limits",
     "tasks_limit": "limits",
+    "watch": "reload",
     "watchdog": "owes",
 }
 """By key of each setting that a runner receives as text, its module in decisions/settings/."""
@@ -90,7 +92,6 @@ class RunnerOptions(NamedTuple):
     exit_when_nodes_finish: bool | None = None
     env_keys: tuple[str, ...] = ()  # names of the variables that override the descriptor's `env:`
     start_timeout: int = INFINITY  # µs for all nodes to become ready, or INFINITY
-    reload: HotReload = DEFAULT_RELOAD  # files that cause a reload, and how nodes are replaced
     settings: tuple[SettingText, ...] = ()  # see dora_systemd.decisions.settings
     placed: tuple[Placed, ...] = ()  # the nodes that run on other machines than the head
     # machine, head: on a member its name, and the host name of the head; else ""
@@ -105,7 +106,7 @@ class RunnerOptions(NamedTuple):
     @property
     def hot_reload(self) -> bool:
         """Whether files are watched."""
-        return self.reload.is_on
+        return self.has("hot_reload") and bool(self.of_dataflow("hot_reload"))
 
     def has(self, key: str) -> bool:
         """Whether the dataflow or a node has a value of the setting."""
@@ -245,15 +246,10 @@ _OPTIONS = (
     _unless_default("head", "head", parse_head),
     _each("address", "addresses", _late("machines.address", "parse_address")),
     _unless_default("on-failure", "on_failure", _parse_words, _format_words),
-    _each("watch", "reload.watch"),
-    _each("ignore", "reload.ignore"),
-    _each("node-watch", "reload.node_watch", parse_of_node, "=".join),
-    _each("replace", "reload.replace", parse_of_node, "=".join),
     _flag("uv", "uv"),
     _flag("debug", "debug"),
     _flag("allow-shell-nodes", "allow_shell_nodes"),
     _flag("attached", "attached"),
-    _flag("hot-reload", "reload.is_on"),
 )
 """All options in the order of the command line, which ends with the path of the dataflow."""
 
@@ -264,7 +260,7 @@ def format_runner_argv(options: RunnerOptions) -> list[str]:
     """The arguments of `python3 -m dora_systemd.runner`, with readable long options."""
     arguments = []
     for one in _OPTIONS:
-        texts = one.format(attrgetter(one.field)(options))
+        texts = one.format(getattr(options, one.field))
         arguments += [f"--{one.key}" if one.is_flag else f"--{one.key}={text}" for text in texts]
     return [*arguments, options.dataflow]
 
@@ -299,9 +295,7 @@ def _split(argument: str) -> tuple[Option, str]:
 
 def _options(dataflow: str, given: dict[str, list[str]]) -> RunnerOptions:
     parsed = {one.field: one.parse(given[one.key]) for one in _OPTIONS if one.key in given}
-    own = {field: value for field, value in parsed.items() if "." not in field}
-    of_reload = {field.removeprefix("reload."): parsed[field] for field in parsed.keys() - own}
-    return RunnerOptions(dataflow=dataflow, **own, reload=HotReload(**of_reload))
+    return RunnerOptions(dataflow=dataflow, **parsed)
 
 
 def runner_command(python: str, options: RunnerOptions) -> list[str]:

@@ -77,6 +77,8 @@ class Setting(Generic[T]):
     # for a value for the dataflow that names nodes: what the runner gets instead, by node, "" for
     # the dataflow, and by key. From the values that files give nodes, and the one for the dataflow.
     by_node: Callable[[Mapping[str, Any], Any], Mapping[str, Mapping[str, Any]]] | None = None
+    # makes of a value what the runner gets, when the working directory is known
+    at_start: Callable[[Any, str], Any] | None = None
     # raises DoraSystemdError (BAD_INPUT) for values in the options of a runner that these nodes of
     # the dataflow cannot have
     check: Callable[[RunnerOptions, Sequence[Node]], None] | None = None

@@ -2,8 +2,12 @@
 
 from typing import Any
 
-from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
-from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, parse_patterns
+from dora_systemd.decisions.reload.changes import REPLACE_WORDS
+from dora_systemd.decisions.reload.watch_rules import (
+    DEFAULT_WATCH,
+    parse_patterns,
+    relative_patterns,
+)
 from dora_systemd.decisions.settings.kinds import BOOL, Setting, many_texts, one_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
@@ -28,6 +32,8 @@ WATCH = Setting[tuple[str, ...]](
     f"Files that trigger a reload, as in gitignore(5); default: {', '.join(DEFAULT_WATCH)}.",
     variable="DORA_WATCH",
     per_node=True,
+    on_members=False,
+    at_start=relative_patterns,
 )
 IGNORE = Setting[tuple[str, ...]](
     "ignore",
@@ -35,6 +41,7 @@ IGNORE = Setting[tuple[str, ...]](
     (),
     "Files that never trigger a reload, besides those that git ignores.",
     variable="DORA_IGNORE",
+    at_start=relative_patterns,
 )
 REPLACE = Setting[str](
     "replace",
@@ -42,6 +49,8 @@ REPLACE = Setting[str](
     "stop-first",
     "A reloaded node stops before its replacement starts (stop-first) or after (start-first).",
     per_node=True,
+    on_members=False,
 )
 
 RELOAD_SETTINGS: tuple[Setting[Any], ...] = (HOT_RELOAD, WATCH, IGNORE, REPLACE)
+RUNNER_SETTINGS = {one.name: one for one in RELOAD_SETTINGS}

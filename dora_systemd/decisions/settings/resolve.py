@@ -9,7 +9,6 @@ from functools import reduce
 from pathlib import PurePath
 from typing import Any, TypeVar, cast
 
-from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.options import (
     MODULES,
     RunnerOptions,
@@ -19,11 +18,10 @@ from dora_systemd.decisions.cell.options import (
 )
 from dora_systemd.decisions.cell.owes import RESTART
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
-from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
 from dora_systemd.decisions.settings.on_failure import ON_FAILURE
 from dora_systemd.decisions.settings.owes import OWES
-from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
+from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
@@ -229,18 +227,23 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         grace=settings[GRACE_DURATION],
         exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
         start_timeout=settings[START_TIMEOUT],
-        reload=hot_reload(settings, options.working_directory),
-        settings=changed(tuple(runner_texts(settings)), settings.passed),
+        settings=changed(tuple(runner_texts(settings, options.working_directory)), settings.passed),
         on_failure=settings[ON_FAILURE],
     )
 
 
-def runner_texts(settings: Settings) -> Iterator[SettingText]:
-    """The settings that the runner receives as text, as far as they are given."""
+def runner_texts(settings: Settings, directory: str | None = None) -> Iterator[SettingText]:
+    """The settings that the runner receives as text, as far as they are given.
+
+    directory: the working directory, None as long as nothing starts. Raises DoraSystemdError.
+    """
     table = {setting.name: setting for setting in settings.table}
     for node, values in _by_node(settings).items():
         for key, value in values.items():
-            yield from (SettingText(node, key, text) for text in table[key].kind.format(value))
+            setting = table[key]
+            if setting.at_start and directory is not None:
+                value = setting.at_start(value, directory)
+            yield from (SettingText(node, key, text) for text in setting.kind.format(value))
 
 
 def _by_node(settings: Settings) -> dict[str, dict[str, Any]]:
@@ -256,26 +259,6 @@ def _by_node(settings: Settings) -> dict[str, dict[str, Any]]:
         elif setting.name in MODULES and not setting.property and settings.is_given(setting):
             found[""][setting.name] = settings[setting]
     return found
-
-
-def hot_reload(settings: Settings, root: str) -> HotReload:
-    """The options for hot reload; patterns are relative to `root`, the working directory.
-
-    Raises DoraSystemdError (USAGE) for an absolute pattern outside of it.
-    """
-    watch, ignore = settings[WATCH], settings[IGNORE]
-    of_nodes = {
-        node: relative_patterns(patterns, root)
-        for node, patterns in settings.by_node(WATCH).items()
-    }
-    for_all = [("", settings[REPLACE])] if settings.is_given(REPLACE) else []
-    return HotReload(
-        settings[HOT_RELOAD],
-        relative_patterns(watch, root),
-        relative_patterns(ignore, root),
-        tuple((node, one) for node, patterns in of_nodes.items() for one in patterns),
-        (*for_all, *settings.by_node(REPLACE).items()),
-    )
 
 
 def idle_warnings(settings: Settings) -> Iterator[str]:

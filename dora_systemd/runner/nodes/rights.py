@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.dora.preparation import check_named_nodes
 from dora_systemd.adapters.host.rights import check_cpus, prove_rights, read_base
 from dora_systemd.decisions.cell.limits import CPUS, has_cpus, limits_of
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -15,7 +14,6 @@ from dora_systemd.decisions.cell.rights import (
     rights_commands,
     rights_of,
 )
-from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.values import format_cpus
 
 _OF_UNITS = re.compile(r"/(dora-|doractl-check-)[^/]+\.service(/|$)")
@@ -36,16 +34,13 @@ def launcher_rights(options: RunnerOptions, unit: Path) -> str:
 
 def check_first(
     options: RunnerOptions,
-    dataflow: Dataflow,
     group: str | None = None,
     prove: Callable[[Sequence[NodeRights]], None] = prove_rights,
 ) -> None:
-    """Check the options of single nodes, and prove that this machine grants the nodes' rights.
+    """Prove that this machine grants the rights of single nodes, and has their CPUs.
 
-    Raises DoraSystemdError. dataflow: with modules expanded. group: that of this process, None to
-    read it from the kernel.
+    Raises DoraSystemdError. group: that of this process, None to read it from the kernel.
     """
-    check_named_nodes(options, dataflow)
     # A dry run of a user is in no unit, and has the rights of that shell.
     if _OF_UNITS.search(group or cgroup.group_of()):
         check_cpus(limits_of(options))

@@ -17,7 +17,7 @@ from dora_systemd.decisions.cell.owes import owes_of
 from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.life.view import has_started
-from dora_systemd.decisions.reload.changes import How, Step, has_readers
+from dora_systemd.decisions.reload.changes import START_FIRST, How, Step, has_readers
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.reload.sources import Change, Versions
@@ -137,8 +137,9 @@ class Applier:
             old = self.run.pump.cell.nodes[step.node]
             # In the middle of an undo, nodes of both versions can run.
             is_needed = is_read(step.node, self._options, prepared, self._change.prepared)
-            starts_first = self._options.reload.starts_first(step.node)
-            await swapper.swap(definition, kind, is_needed, starts_first)
+            has_word = self._options.has("replace")
+            word = self._options.of_node(step.node, "replace") if has_word else ""
+            await swapper.swap(definition, kind, is_needed, word == START_FIRST)
             if old.needs:  # two launchers must not start the node
                 await self.run.nodes.wait_gone(step.node, old.pid)
 

@@ -11,7 +11,6 @@ from pathlib import Path, PurePath
 from dora_systemd.adapters.dora.check import refusal_of_dora
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
 from dora_systemd.adapters.host.watch import Identity, Since, changed_files, identity, watch_rules
-from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.launch import kinds, launch_descriptor, sources
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.nodes import NodeKind
@@ -180,11 +179,10 @@ class Sources:
     def _nodes(
         self, prepared: Prepared, programs: Mapping[str, Mapping[str, str]], versions: Versions
     ) -> dict[str, NodeSources]:
-        rules: HotReload = self._options.reload
-        root = self._options.working_directory
+        own, root = self._options.by_node("watch"), self._options.working_directory
         found = {}
         for node in prepared.dataflow.nodes:
-            patterns = rules.watched_by(node.id)
+            patterns = own.get(node.id, ())
             files = self._files(programs[node.id].values(), node.kind)
             found[node.id] = NodeSources(
                 files,

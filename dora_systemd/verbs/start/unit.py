@@ -153,7 +153,7 @@ def watched_patterns(plan: Plan) -> tuple[str, ...]:
     """The patterns of the files that cause a reload, empty without hot reload."""
     if not plan.options.hot_reload:
         return ()
-    return plan.options.reload.watch or DEFAULT_WATCH
+    return plan.options.of_dataflow("watch") or DEFAULT_WATCH
 
 
 def watch_warnings(plan: Plan) -> Iterator[str]:
@@ -162,7 +162,7 @@ def watch_warnings(plan: Plan) -> Iterator[str]:
     Only the owner of the files gets these: as root, doractl would search another user's
     directories.
     """
-    if not plan.options.hot_reload or not plan.options.reload.watch or _is_anothers(plan):
+    if not plan.options.hot_reload or not plan.options.of_dataflow("watch") or _is_anothers(plan):
         return
     # Imported late: asyncio is slow to import, and only given patterns need a search.
     from dora_systemd.adapters.host.watch import watch_rules, watched_files

@@ -122,6 +122,13 @@ def test_changes_add_up(place: Place) -> None:
     assert (place.group / "memory.max").read_text() == "max"
 
 
+def test_hot_reload_is_remembered_beside_the_limits(place: Place) -> None:
+    place.manager.units[place.unit]["Environment"].append("DORA_SYSTEMD_SET=camera:cpu_limit=150%")
+    switch_hot_reload(place.manager, place.scope, place.cell, False, lambda *_: {})
+    variable = "DORA_SYSTEMD_SET=camera:cpu_limit=150%% hot_reload=no"
+    assert f'Environment="{variable}"' in place.drop_in.read_text()
+
+
 def test_what_is_too_small_or_too_large_is_said(place: Place) -> None:
     (place.group / "memory.current").write_text(str(5 << 20))
     with pytest.raises(DoraSystemdError) as caught:

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS, HotReload
 from dora_systemd.decisions.cell.line_rates import ALL_NODES
 from dora_systemd.decisions.cell.options import (
     MODULES,
@@ -59,14 +58,6 @@ options = st.builds(
     exit_when_nodes_finish=st.none() | st.booleans(),
     env_keys=st.lists(texts).map(tuple),
     start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
-    reload=st.builds(
-        HotReload,
-        st.booleans(),
-        st.lists(texts).map(tuple),
-        st.lists(texts).map(tuple),
-        st.lists(st.tuples(idents, texts)).map(tuple),
-        st.lists(st.tuples(st.just("") | idents, st.sampled_from(REPLACE_WORDS))).map(tuple),
-    ),
 )
 
 
@@ -87,15 +78,14 @@ ALL = RunnerOptions(
     exit_when_nodes_finish=False,
     env_keys=("MODEL", "RATE"),
     start_timeout=90 * SECOND,
-    reload=HotReload(
-        True, ("*.py", "a=b"), ("tmp_*",), (("camera", "x=y"),), (("", "start-first"), ("a", "b"))
-    ),
     settings=(
         SettingText("camera", "nice", "5"),
         SettingText("camera", "owes", "/image:within=2s,first=1min 30s,then=warn"),
         SettingText("", "restart_policy", "on-failure"),
         SettingText("a:b", "max_restarts", "infinity"),
         SettingText("", "stop_limit", "1h"),
+        SettingText("camera", "watch", "x=y"),
+        SettingText("", "replace", "start-first"),
     ),
 )
 ARGUMENTS = f"""\
@@ -105,8 +95,8 @@ ARGUMENTS = f"""\
 --env-key=MODEL --env-key=RATE
 --set=camera:nice=5 '--set=camera:owes=/image:within=2s,first=1min 30s,then=warn'
 --set=restart_policy=on-failure --set=a:b:max_restarts=infinity --set=stop_limit=1h
---watch=*.py --watch=a=b --ignore=tmp_* --node-watch=camera=x=y --replace==start-first --replace=a=b
---uv --debug --allow-shell-nodes --attached --hot-reload /srv/robot.yml
+--set=camera:watch=x=y --set=replace=start-first
+--uv --debug --allow-shell-nodes --attached /srv/robot.yml
 """
 
 

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.environment import changes_entry
-from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE, HotReload
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.options import parse_setting
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
@@ -27,7 +26,7 @@ from dora_systemd.decisions.gateway.page_messages import (
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped
 from dora_systemd.values import INFINITY
-from tests.unit.fakes.manager import options, with_limits
+from tests.unit.fakes.manager import options, with_limits, with_texts
 
 
 def test_messages() -> None:
@@ -180,10 +179,10 @@ def test_limits_are_what_set_takes() -> None:
 
 
 def test_changes_of_set_take_precedence() -> None:
-    own = with_limits(options(reload=HotReload(is_on=True)), parse_node_limits("a:memory=1G,cpu=2"))
-    texts = ("a:memory_limit=2G", "b:tasks_limit=9", "c:tasks_limit=infinity")
+    limits = parse_node_limits("a:memory=1G,cpu=2")
+    own = with_limits(with_texts(options(), "hot_reload=yes"), limits)
+    texts = ("a:memory_limit=2G", "b:tasks_limit=9", "c:tasks_limit=infinity", "hot_reload=no")
     changes = [changes_entry(map(parse_setting, texts))]
-    changes += [f"{CHANGE_VARIABLE}=no"]
     found = fact_values(own, {**UNSET, "Environment": changes})
     assert found["node_limit"] == ["a:cpu=200%,memory=2G", "b:tasks=9"]
     assert found["hot_reload"] is False

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
+from dora_systemd.decisions.reload.changes import REPLACE_WORDS
 from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
 from dora_systemd.decisions.settings.machines import Declared
 from dora_systemd.decisions.settings.resolve import (

@@ -7,14 +7,10 @@ import pytest
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import parse_node_rights
-from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import daemon_variables
 from dora_systemd.runner.nodes.rights import check_first, launcher_rights
 from tests.unit.fakes.manager import options, with_limits, with_rights
-
-FLOW = parse_dataflow({"nodes": [{"id": "camera", "path": "camera.py"}]}, "robot.yml")
 
 
 def with_cpus() -> RunnerOptions:
@@ -52,10 +48,5 @@ def test_the_launcher_binds_nodes_only_where_no_cgroup_does(tmp_path: Path) -> N
 def test_rights_are_proved_in_a_unit(group: str, is_proved: bool) -> None:
     proved: list[object] = []
     rights = (parse_node_rights("camera:nice=5"),)
-    check_first(with_rights(options(), *rights), FLOW, group, proved.append)
+    check_first(with_rights(options(), *rights), group, proved.append)
     assert proved == [rights] * is_proved
-
-
-def test_rights_of_a_node_that_is_not_there() -> None:
-    with pytest.raises(DoraSystemdError, match="the node 'radar': no such node"):
-        check_first(with_rights(options(), parse_node_rights("radar:essential")), FLOW)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.dora.preparation import Prepared
-from dora_systemd.decisions.cell.hot_reload import START_FIRST, HotReload
+from dora_systemd.decisions.cell.options import parse_setting
 from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -97,8 +97,11 @@ def test_a_node_is_replaced_as_by_hand(
 @pytest.mark.parametrize(
     ("old", "options"),
     [
-        (RUNNING, {"reload": HotReload(replace=(("a", START_FIRST),))}),
-        (RUNNING._replace(policy="never"), {"reload": HotReload(replace=(("", START_FIRST),))}),
+        (RUNNING, {"settings": (parse_setting("a:replace=start-first"),)}),
+        (
+            RUNNING._replace(policy="never"),
+            {"settings": (parse_setting("replace=start-first"),)},
+        ),
         (RUNNING._replace(state="waiting", needs="/dev/cam"), {}),
     ],
     ids=["start first", "start first without restarts", "it waits"],

@@ -10,13 +10,13 @@ import pytest
 
 from dora_systemd import __version__
 from dora_systemd.adapters.dora.preparation import prepare
-from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from tests.unit.fakes.loop import within
+from tests.unit.fakes.manager import with_texts
 from tests.unit.fakes.reload import ReloadBench
 
 
@@ -25,7 +25,7 @@ class Bench(ReloadBench):
 
     def __init__(self, root: Path, state: State = State.RUNNING, is_hot: bool = False) -> None:
         super().__init__(root, state)
-        self.options = self.options._replace(reload=HotReload(is_hot))
+        self.options = with_texts(self.options, f"hot_reload={is_hot}".lower())
         self.prepared = self.write("ab")
         settings = SettingsFile(str(root / "flow.systemd.yml"), root / "settings.yml")
         self.reloader = Reloader(self.options, {}, settings)

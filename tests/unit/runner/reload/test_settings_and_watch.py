@@ -107,9 +107,9 @@ def test_watching_that_breaks_is_told(tmp_path: Path) -> None:
     async def work() -> None:
         bench = Bench(tmp_path)
         bench.begin()
-        options = bench.options._replace(reload=cast(Any, None))
+        options = bench.options._replace(dataflow=cast(Any, None))
         await bench.reloader._watcher.collect(options)
-        assert "cannot watch files any more: AttributeError" in bench.reasons[0]
+        assert "cannot watch files any more: TypeError" in bench.reasons[0]
 
     live(work)
 
