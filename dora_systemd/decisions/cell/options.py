@@ -47,6 +47,7 @@ MODULES = {
     "needs": "needs",
     "nice": "limits",
     "notify": "owes",
+    "on_failure": "on_failure",
     "oom_score_adjust": "rights",
     "owes": "owes",
     "replace": "reload",
@@ -97,7 +98,6 @@ class RunnerOptions(NamedTuple):
     # machine, head: on a member its name, and the host name of the head; else ""
     machine: str = ""
     head: str = ""
-    on_failure: tuple[str, ...] = ()  # the command of a notice, or a unit; () for no notice
     addresses: tuple[str, ...] = ()  # with `link: direct` those of all machines, the own one first
 
     def __hash__(self) -> int:
@@ -126,6 +126,11 @@ class RunnerOptions(NamedTuple):
         """The values that single nodes have of the setting, by node."""
         assert key in MODULES
         return _by_node(self, key)
+
+    def with_value(self, key: str, value: Any) -> "RunnerOptions":
+        """The options with another value of the setting for the dataflow."""
+        texts = (SettingText("", key, text) for text in runner_setting(key).kind.format(value))
+        return self._replace(settings=changed(self.settings, texts))
 
     def without(self, *keys: str) -> "RunnerOptions":
         """The options without values of these settings."""
@@ -208,11 +213,6 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
     return call
 
 
-_parse_words, _format_words = (
-    _late("notice.command", name) for name in ("parse_words", "format_words")
-)
-
-
 def parse_setting(text: str) -> SettingText:
     """Parse [NODE:]KEY=TEXT, the inverse of format_setting. Raises DoraSystemdError (USAGE)."""
     place, equals, value = text.partition("=")
@@ -245,7 +245,6 @@ _OPTIONS = (
     _unless_default("machine", "machine", parse_machine),
     _unless_default("head", "head", parse_head),
     _each("address", "addresses", _late("machines.address", "parse_address")),
-    _unless_default("on-failure", "on_failure", _parse_words, _format_words),
     _flag("uv", "uv"),
     _flag("debug", "debug"),
     _flag("allow-shell-nodes", "allow_shell_nodes"),

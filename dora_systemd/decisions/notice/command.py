@@ -4,6 +4,7 @@ import re
 import shlex
 from collections.abc import Sequence
 
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import NOTICE_PREFIX, UNIT_PREFIX, is_readable
 from dora_systemd.values import quoted
@@ -48,6 +49,12 @@ def _check_unit(words: Sequence[str], unit: str) -> None:
         raise _refusal(" ".join(words), "write unit:NAME.service, or unit:NAME@.service")
     if unit.startswith((UNIT_PREFIX, NOTICE_PREFIX)):
         raise _refusal(words[0], "a failure must not start a unit of dora-systemd")
+
+
+def words_of(options: RunnerOptions) -> Words:
+    """The command of a notice, or a unit; () for no notice. Raises DoraSystemdError."""
+    words: Words = options.of_dataflow("on_failure") if options.has("on_failure") else ()
+    return words
 
 
 def is_command(words: Words) -> bool:

@@ -30,3 +30,4 @@ ON_FAILURE = Setting[tuple[str, ...]](
     raises=lambda words: bool(words) and words[0].startswith(UNIT),
 )
 NOTICE_SETTINGS: tuple[Setting[Any], ...] = (ON_FAILURE,)
+RUNNER_SETTINGS = {ON_FAILURE.name: ON_FAILURE}

@@ -19,7 +19,6 @@ from dora_systemd.decisions.cell.options import (
 from dora_systemd.decisions.cell.owes import RESTART
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
-from dora_systemd.decisions.settings.on_failure import ON_FAILURE
 from dora_systemd.decisions.settings.owes import OWES
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
@@ -228,7 +227,6 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
         start_timeout=settings[START_TIMEOUT],
         settings=changed(tuple(runner_texts(settings, options.working_directory)), settings.passed),
-        on_failure=settings[ON_FAILURE],
     )
 
 

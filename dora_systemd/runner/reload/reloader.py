@@ -30,7 +30,6 @@ from dora_systemd.runner.reload.apply import Applier, Run, is_read
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.sources import Change, Sources, Versions, Watcher
 from dora_systemd.runner.reload.swap import NotReady, patience
-from dora_systemd.values import format_bool
 
 PAUSE_SECONDS = 1.0
 """Minimum time between the beginnings of two reloads."""
@@ -345,7 +344,7 @@ class Reloader:
 
     async def _switch(self, is_on: bool) -> Answer:
         async with self._lock:
-            self._change([SettingText("", "hot_reload", format_bool(is_on))])
+            self.options = self.options.with_value("hot_reload", is_on)
             self._sources = Sources(self.options, self._environment)
             # This changes only how dora treats nodes that fail: each gets it with its next reload.
             if self.current is not None:

@@ -21,7 +21,6 @@ from dora_systemd import __version__
 from dora_systemd.adapters.bus.manager import Manager, is_at_rest
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.host.addresses import is_own
-from dora_systemd.decisions.cell.options import SettingText, changed
 from dora_systemd.decisions.machines.link_command import relay_command
 from dora_systemd.decisions.machines.part import COPY_HINT, format_other_file
 from dora_systemd.decisions.machines.wire import (
@@ -191,8 +190,7 @@ def _member_plan(plan: Plan, part: Part) -> Plan:
     Its runner can shorten the grace duration of the settings, which its doractl and this machine
     have given. Longer, it could keep this machine from a shutdown.
     """
-    options = plan.options._replace(
-        settings=changed(plan.options.settings, [SettingText("", "restart_policy", "no")]),
+    options = plan.options.with_value("restart_policy", "no")._replace(
         start_timeout=INFINITY,
         grace=min(part.grace, plan.options.grace),
     )

@@ -11,7 +11,7 @@ from dora_systemd.adapters.host.files import write_atomic
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.journal_events import NOTICE_FAILED, NOTICE_SENT
-from dora_systemd.decisions.notice.command import unit_of
+from dora_systemd.decisions.notice.command import unit_of, words_of
 from dora_systemd.decisions.notice.happened import (
     Happened,
     format_environment,
@@ -56,7 +56,7 @@ class Sender:
     def send(self, happened: Sequence[Happened], pause_us: int) -> None:
         """Run the command of the setting, and record the notice, whatever came of it."""
         cell = read_cell(self._manager, unit_name(self._name))
-        if cell is None or not cell.options.on_failure:
+        if cell is None or not cell.options.has("on_failure"):
             return self._record("", happened, pause_us, "the dataflow has no on_failure any more")
         node = self._write_report(cell, happened)
         try:
@@ -82,7 +82,7 @@ class Sender:
     def _run(self, cell: Cell, happened: Sequence[Happened], node: str) -> str:
         """Run the command, or start the unit; return what went wrong, or ""."""
         own, host = notice_command_unit(self._name), os.uname().nodename
-        unit = unit_of(cell.options.on_failure, self._name)
+        unit = unit_of(words_of(cell.options), self._name)
         is_here = self._scope.is_user or unit
         evidence = self._place / JSON if is_here else Path("/run/credentials") / own / JSON
         values = variables(self._name, host, cell.unit, happened, node, str(evidence))
@@ -97,7 +97,7 @@ class Sender:
         wanted = NoticeUnit(
             name=self._name,
             uuid=cell.uuid,
-            words=cell.options.on_failure,
+            words=words_of(cell.options),
             directory=cell.options.working_directory,
             environment=(*of_nodes, *(f"{key}={text}" for key, text in values.items())),
             stdin=str(self._place / _TEXT),

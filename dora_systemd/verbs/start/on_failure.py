@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.notice.command import Words, is_command, unit_of
+from dora_systemd.decisions.notice.command import Words, is_command, unit_of, words_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import notice_unit
 from dora_systemd.scope import Scope
@@ -40,11 +40,11 @@ def find_command(
 
 def check_units(manager: Manager, scope: Scope, options: RunnerOptions) -> None:
     """Raise DoraSystemdError (BAD_INPUT) if systemd does not know a unit that a notice needs."""
-    if not options.on_failure:
+    if not options.has("on_failure"):
         return
     hint = f"install it: doractl {scope.flag} setup"
     _check_unit(manager, notice_unit(options.name), hint)
-    if unit := unit_of(options.on_failure, options.name):
+    if unit := unit_of(words_of(options), options.name):
         _check_unit(manager, unit, "see systemctl list-unit-files")
 
 

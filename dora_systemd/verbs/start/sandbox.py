@@ -16,7 +16,7 @@ from dora_systemd.decisions.cell.rights import has_process_rights, rights_of
 from dora_systemd.decisions.cell.uv import uv_project
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.needs.units import device_entries, needs_can
-from dora_systemd.decisions.notice.command import is_command
+from dora_systemd.decisions.notice.command import is_command, words_of
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
@@ -164,7 +164,7 @@ def _needed(dataflow: Dataflow, launch: LaunchPlan, sight: Sight) -> Iterator[Pa
     for program in (options.dora, python_of(launch)):
         # A virtual environment links to the Python that it was created from.
         yield from (_prefix(Path(program)), _prefix(Path(sight.real(program))))
-    yield from map(Path, options.on_failure[:1] if is_command(options.on_failure) else ())
+    yield from map(Path, words[:1] if is_command(words := words_of(options)) else ())
     yield from named_places(dataflow, sight)
     yield from map(Path, (*session.directories.values(), *session.envs.values()))
 

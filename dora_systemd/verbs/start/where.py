@@ -20,6 +20,7 @@ from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.expansion import called_variables
+from dora_systemd.decisions.notice.command import words_of
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.decisions.settings.resolve import Settings, with_settings
@@ -175,9 +176,11 @@ def find_where(
         addresses=request.addresses,
     )
     options = with_settings(options, settings)
-    command = () if options.machine else options.on_failure  # the head sends the notices
-    found = find_command(command, look.sight, look.user, search_path)
-    options = options._replace(on_failure=found)
+    if options.machine:
+        options = options.without("on_failure")  # the head sends the notices
+    if words := words_of(options):
+        found = find_command(words, look.sight, look.user, search_path)
+        options = options.with_value("on_failure", found)
     if options.hot_reload:
         # Imported late: few dataflows have it, and asyncio is slow to import.
         from dora_systemd.adapters.host.watch import require_watcher

@@ -53,7 +53,6 @@ options = st.builds(
     machine=st.just(""),
     head=st.just(""),
     addresses=st.just(()),
-    on_failure=st.just(()),
     attached=st.booleans(),
     exit_when_nodes_finish=st.none() | st.booleans(),
     env_keys=st.lists(texts).map(tuple),

@@ -7,7 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.options import format_runner_argv, parse_runner_argv
-from dora_systemd.decisions.notice.command import checked_words, format_words, parse_words, unit_of
+from dora_systemd.decisions.notice.command import (
+    checked_words,
+    format_words,
+    parse_words,
+    unit_of,
+    words_of,
+)
 from dora_systemd.decisions.settings.on_failure import ON_FAILURE
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.fakes.manager import options
@@ -18,8 +24,8 @@ printable = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, ma
 @given(st.lists(printable.filter(lambda one: not one.startswith("unit:")), min_size=1, max_size=5))
 def test_words_and_back(words: list[str]) -> None:
     assert parse_words(format_words(tuple(words))) == tuple(words)
-    told = options(on_failure=tuple(words))
-    assert parse_runner_argv(format_runner_argv(told)).on_failure == tuple(words)
+    told = options().with_value("on_failure", tuple(words))
+    assert words_of(parse_runner_argv(format_runner_argv(told))) == tuple(words)
 
 
 @pytest.mark.parametrize(

@@ -265,7 +265,8 @@ def test_an_old_systemd_sends_no_notice_of_a_life_that_is_restarted(
     directory = tmp_path / "dora-systemd-notice/robot"
     directory.mkdir(parents=True)
     given = {"RUNTIME_DIRECTORY": f"/run/dora-systemd/robot:{directory}", **environment}
-    report_last_life(options(on_failure=words), given)
+    runner = options().with_value("on_failure", words)
+    report_last_life(runner, given)
     assert list(directory.iterdir()) == [directory / "request"] * is_requested
 
 

@@ -32,7 +32,7 @@ def test_a_failed_check_starts_no_other_unit() -> None:
     """OnFailure= of the dataflow would send a notice of a dataflow that runs."""
     manager, plan = PrintingManager(), make_plan()
     manager.units["doranotice@robot.service"] = {"LoadState": "loaded", "ActiveState": "inactive"}
-    options = plan.options._replace(on_failure=("/bin/tell",))
+    options = plan.options.with_value("on_failure", ("/bin/tell",))
     check_plan(lambda: manager, replace(plan, options=options))
     assert "OnFailure" not in manager.given
 

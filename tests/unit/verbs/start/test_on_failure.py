@@ -59,7 +59,7 @@ TEMPLATE = ("unit:x@.service",)
 def test_units_that_systemd_has_to_know(manager: Any, words: Any, missing: str) -> None:
     message = ""
     try:
-        check_units(manager, SCOPE, options(on_failure=words))
+        check_units(manager, SCOPE, options().with_value("on_failure", words))
     except DoraSystemdError as error:
         assert error.code is ExitCode.BAD_INPUT
         message = error.message
