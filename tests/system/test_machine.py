@@ -181,6 +181,8 @@ def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> 
     assert done.stderr == ""
     changed = [str(1500 << 20), str(600 << 20), "80000 100000", "30", "77"]
     assert held(cell) == changed
+    (source,) = [one for one in listed(cell)["nodes"] if one["node"] == "source"]
+    assert (source["tasks_limit"], 0 < source["tasks"] <= 77) == (77, True)
     text = cell.doractl("show", cell.name).stdout
     assert "MemoryMax=1572864000" in text
     assert "sink:cpu_limit=80%% sink:memory_limit=600M" in text

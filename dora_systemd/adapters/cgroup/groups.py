@@ -181,6 +181,11 @@ def read_controllers(path: Path) -> frozenset[str]:
     return frozenset(read_text(path / "cgroup.controllers").split())
 
 
+def read_tasks(path: Path) -> tuple[int | None, int | None]:
+    """The processes and threads of a group, and its limit of them; None without a controller."""
+    return read_number(f"{path}/pids.current"), read_number(f"{path}/pids.max")
+
+
 def read_cpus(path: Path) -> str:
     """The CPUs that a group itself is bound to, "" if to none."""
     return read_text(path / CPUS_FILE).strip()

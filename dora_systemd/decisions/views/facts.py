@@ -52,6 +52,9 @@ class NodeRow(NamedTuple):
     memory_limit: int | None = None
     # the percentage of the time in which its CPU limit throttled it, None without one
     throttled: float | None = None
+    # tasks: its processes and threads; tasks_limit: the group's own, or None
+    tasks: int | None = None
+    tasks_limit: int | None = None
     since: int = 0  # time of its last change of state, CLOCK_REALTIME µs, 0: unknown
     text: str = ""  # its own STATUS=
     # watchdog, sign_age: the time in which it must send WATCHDOG=1, and how long ago it did, in µs
@@ -111,6 +114,15 @@ def _memory(row: NodeRow) -> str:
 def _restarts(row: NodeRow) -> str:
     used = format_count(row.restarts)
     return f"{used}/{row.max_restarts}" if row.max_restarts else used
+
+
+def _tasks(row: NodeRow) -> str:
+    limit = "" if row.tasks_limit is None else f"/{row.tasks_limit}"
+    return f"{format_count(row.tasks)}{limit}"
+
+
+def _count(row: NodeRow) -> list[Sample]:
+    return [] if row.tasks is None else [({}, row.tasks)]
 
 
 def _watchdog(row: NodeRow) -> str:
@@ -196,6 +208,9 @@ NODE_FACTS = (
         metric="watchdog_age_seconds", help="Time since its last WATCHDOG=1."),
     *USAGE,
     Fact("waits_percent"),
+    Fact("tasks", column="TASKS", cell=_tasks, has=lambda row: row.tasks_limit is not None,
+        metric="tasks", help="Processes and threads that it has.", samples=_count),
+    Fact("tasks_limit"),
     Fact("restarts", told=lambda one: one.restarts, column="RESTARTS", cell=_restarts),
     Fact("max_restarts", told=lambda one: one.max_restarts or None),
     Fact("essential", is_label=True),

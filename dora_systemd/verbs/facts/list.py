@@ -13,6 +13,7 @@ from dora_systemd.decisions.resources.usage import (
     CpuSample,
     Usage,
     cpu_percent,
+    limit_of,
     throttled_percent,
     usage_facts,
 )
@@ -150,6 +151,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                     **_signs(status, node, now.at_us),
                     **_stop_left(status, node, now.at_us),
                     **_right_facts(rights, node),
+                    **_tasks(reading, node),
                     "cpus": _cpus(reading, node),
                     "outputs": _outputs(reading, node),
                 },
@@ -176,6 +178,14 @@ def _right_facts(rights: "dict[str, NodeRights] | None", node: str) -> dict[str,
         return {"essential": None if rights is None else False}
     own = rights[node]
     return {"essential": bool(own.essential), "scheduling": own.scheduling or ""}
+
+
+def _tasks(reading: Reading, node: str) -> dict[str, Any]:
+    """The fields of a row about the processes and threads of a node; {} in the table."""
+    if (group := reading.groups.get(node)) is None:
+        return {}
+    tasks, limit = cgroup.read_tasks(group)
+    return {"tasks": tasks, "tasks_limit": limit_of(limit)}
 
 
 def _cpus(reading: Reading, node: str) -> str:

@@ -61,6 +61,8 @@ ROBOT = DataflowRow(
             text="30 frames/s",
             watchdog=5_000_000,
             sign_age=1_200_000,
+            tasks=9,
+            tasks_limit=50,
             essential=True,
         ),
         NodeRow(

@@ -1,7 +1,13 @@
 """NODE_FACTS has a row for each fact of a node, and says of it what is so."""
 
 from dora_systemd.decisions.cell.status import NodeStatus
-from dora_systemd.decisions.views.facts import NODE_FACTS, NodeRow, node_row, node_table
+from dora_systemd.decisions.views.facts import (
+    NODE_FACTS,
+    NodeRow,
+    node_row,
+    node_samples,
+    node_table,
+)
 from dora_systemd.decisions.views.rows import DATAFLOW_FACTS, DataflowRow
 
 SHOWN_BY_OTHERS = {"waits_percent"}
@@ -47,3 +53,14 @@ def test_texts_are_the_last_columns() -> None:
     assert titles[-3:] == ["EXIT", "WATCHDOG", "STATUS TEXT"]
     assert (len(cells), cells[-1]) == (12, "hot")
     assert len(node_table([NodeRow("camera", "running")])[0]) == 8
+
+
+def test_processes_of_a_node_with_a_limit_of_them() -> None:
+    limited = NodeRow("camera", "running", tasks=9, tasks_limit=50)
+    titles, (cells, other) = node_table([limited, NodeRow("sink", "running", tasks=3)])
+    column = titles.index("TASKS")
+    assert (cells[column], other[column]) == ("9/50", "3")
+    assert "TASKS" not in node_table([NodeRow("sink", "running", tasks=3)])[0]
+    fact = next(one for one in NODE_FACTS if one.metric == "tasks")
+    assert node_samples(fact, limited) == [({}, 9)]
+    assert node_samples(fact, NodeRow("away", "running")) == []

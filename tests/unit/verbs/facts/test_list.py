@@ -56,6 +56,8 @@ def unit_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (place / "cpu.stat").write_text(f"usage_usec {cpu}\n")
         (place / "memory.current").write_text(f"{memory}\n")
         (place / "cgroup.events").write_text("populated 1\n")
+    (node / "pids.current").write_text("9\n")
+    (node / "pids.max").write_text("50\n")
     return group
 
 
@@ -141,6 +143,7 @@ def test_running_dataflow(scope: Scope) -> None:
     camera, plot = row.nodes
     assert (camera.pid, camera.memory, camera.state) == (42, 1 << 20, "running")
     assert camera.cpu_percent == pytest.approx(25, rel=0.2)
+    assert (camera.tasks, camera.tasks_limit) == (9, 50)
     assert (plot.exit, plot.memory, plot.cpu_percent) == ("exit code 1", None, None)
 
 
