@@ -3,9 +3,9 @@
 `limits.py` has one line for each resource that can be limited: setting, word of `--node-limit`,
 unit property, control file of the controller. Limits of the dataflow become unit properties. Limits
 of nodes are in the runner's command line, and the runner writes them before any node starts.
-ExecStart= of a loaded unit cannot change, so `doractl set` puts limits of nodes, and limits of log
-lines, into a drop-in with a variable of its own. A reload alone does not make systemd 257 apply new
-limits to a running unit.
+ExecStart= of a loaded unit cannot change, so `doractl set` puts what it has changed of the runner's
+settings into a drop-in, as one variable. A reload alone does not make systemd 257 apply new limits
+to a running unit.
 
 `rights.py` has one line for each right of a node: setting, word of `--node-rights`, and which
 values only root may set. The unit grants all of its processes what one node needs

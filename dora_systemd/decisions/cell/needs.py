@@ -98,11 +98,6 @@ def _refusal(text: str, hint: str) -> DoraSystemdError:
     return DoraSystemdError(f"cannot wait for {quoted(text)}", hint, ExitCode.USAGE)
 
 
-def is_foreign(need: str) -> bool:
-    """Whether the need makes systemd start something that may be another user's."""
-    return need.startswith(FOREIGN)
-
-
 def needs_by_node(
     given: tuple[str, ...], by_node: Mapping[str, tuple[str, ...]]
 ) -> dict[str, tuple[str, ...]]:
