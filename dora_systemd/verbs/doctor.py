@@ -17,6 +17,7 @@ from dora_systemd.adapters.dora.command import (
     find_dora,
     version_numbers,
 )
+from dora_systemd.adapters.host.interrupts import Interrupts
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.real_time import read_real_time
@@ -54,6 +55,7 @@ from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_dire
 from dora_systemd.verbs.facts.list import dataflow_row
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.facts.stack import read_pattern
+from dora_systemd.verbs.facts.waits import shared_interrupts
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.enable import boot_target
@@ -69,6 +71,7 @@ _SECONDS = 20.0
 _STARTED = "ExecMainStartTimestamp"
 _JOURNALD_CONFIG = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
 _COREDUMP_CONFIG = ("systemd-analyze", "--no-pager", "cat-config", "systemd/coredump.conf")
+_PRESSURE = "proc/pressure"
 _CONTAINER = "run/systemd/container"
 """systemd writes the kind of its container to this file, see systemd-detect-virt(1)."""
 _BROKEN = ("bad-setting", "error")
@@ -268,6 +271,21 @@ def _versions(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
             yield Finding("versions", State.WARNING, f"{cell.name}: {text}", remedy)
 
 
+def _pressure(_scope: Scope, root: Path) -> Iterator[Finding]:
+    if (root / CORE_PATTERN).exists() and not (root / _PRESSURE).exists():
+        text = "the kernel does not measure what nodes wait for: top has no WAITS FOR"
+        yield Finding("pressure", State.NOTE, text, "boot with psi=1")
+
+
+def _interrupts(manager: Manager, _scope: Scope, root: Path) -> Iterator[Finding]:
+    """Compare the CPUs of nodes with those that handle the interrupts of their devices."""
+    interrupts = Interrupts(root)
+    for cell in proven(read_cells(manager)):
+        for one in shared_interrupts(interrupts, cell.options):
+            text = f"{cell.name}/{one.node}: cpus {one.cpus} also have {one}"
+            yield Finding("interrupts", State.NOTE, text, one.remedy)
+
+
 def _coredumps(_scope: Scope, root: Path) -> Iterator[Finding]:
     if not (root / CORE_PATTERN).exists():
         return
@@ -332,5 +350,7 @@ def _below(root: Path, path: Path) -> Path:
     return root / path.relative_to("/")
 
 
-_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports, _releases, _versions)
-_WITHOUT = (_dora, _user, _logins, _settings, _processes, _real_time, _coredumps, _upgrades)
+_OF_DATAFLOWS = (_units, _leftovers, _ports, _releases, _versions, _interrupts)
+_WITH_SYSTEMD = (_controllers, _linger, _boot, *_OF_DATAFLOWS)
+_OF_MACHINE = (_processes, _real_time, _pressure, _coredumps, _upgrades)
+_WITHOUT = (_dora, _user, _logins, _settings, *_OF_MACHINE)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
@@ -35,6 +36,7 @@ from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.stack import read_pattern, read_stack
+from dora_systemd.verbs.facts.waits import read_cpu_waits
 from dora_systemd.verbs.list import read_whole_rows
 
 _MOST_SHUTDOWNS = 20
@@ -66,6 +68,15 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     machines = _machines(manager, cell) if cell and cell.options.placed else {}
     more = (last, is_of_trial, stack, keeps_core_dumps(read_pattern()))
     return Report(subject, verdict, words, budget, inhibitors, is_held, machines, *more)
+
+
+def explain_now(manager: Manager, scope: Scope, selector: str, journal: JournalReader) -> Report:
+    """Explain as explain(), and what the nodes wait for now, which may take a moment."""
+    report = explain(manager, scope, selector, journal)
+    if not (report.verdict.is_up and report.subject.is_loaded):
+        return report
+    cell = read_cell(manager, report.subject.unit)
+    return replace(report, waits=read_cpu_waits(manager, scope, cell)) if cell else report
 
 
 def _verdict(journal: JournalReader, scope: Scope, subject: Subject, facts: Facts) -> Verdict:

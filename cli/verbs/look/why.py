@@ -8,7 +8,7 @@ from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.why.report import format_report, report_object
 from dora_systemd.errors import ExitCode
-from dora_systemd.verbs.why import explain, newest_failure, subject_row
+from dora_systemd.verbs.why import explain_now, newest_failure, subject_row
 
 
 @click.command("why")
@@ -31,7 +31,7 @@ def command(selector: str | None, output: str) -> int:
     scope = current_scope()
     check_readable(scope)
     bus = Bus(scope, for_reading=True)
-    report = explain(bus, scope, selector or newest_failure(bus, scope), JournalReader())
+    report = explain_now(bus, scope, selector or newest_failure(bus, scope), JournalReader())
     if output == "json":
         print_json(report_object(report, subject_row(bus, scope, report.subject)))
         return ExitCode.OK

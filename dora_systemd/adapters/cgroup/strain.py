@@ -9,7 +9,7 @@ from dora_systemd.decisions.resources.pressure import Load
 from dora_systemd.decisions.resources.usage import RESOURCES, Strain
 from dora_systemd.values import INFINITY
 
-_PRESSURE = re.compile(r"^(some|full) avg10=([0-9.]+) .*total=(\d+)$", re.M)
+_PRESSURE = re.compile(r"^(some|full) avg10=([0-9.]+)(?: avg60=([0-9.]+))?.* total=(\d+)$", re.M)
 
 
 def read_strain(path: Path) -> Strain:
@@ -43,10 +43,22 @@ def read_load(path: Path) -> Load:
     return Load(stat.get("anon", 0) + stat.get("shmem", 0), limit, _read_stalled(path))
 
 
+def read_waited(path: Path) -> float | None:
+    """Percent of the last minute in which some process of a group waited for a CPU.
+
+    This includes throttling by a CPU limit. None if the kernel does not measure it.
+    """
+    match = _PRESSURE.search(read_text(path / "cpu.pressure"))
+    return float(match[3]) if match and match[3] else None
+
+
 def _read_stalls(path: str) -> tuple[int, int] | None:
     """Read both totals of a pressure file in µs; None if the kernel does not measure them."""
-    totals = {kind: int(total) for kind, _, total in _PRESSURE.findall(read_text(path))}
-    return (totals["some"], totals.get("full", 0)) if "some" in totals else None
+    totals = {kind: int(total) for kind, *_, total in _PRESSURE.findall(read_text(path))}
+    if not totals:
+        return None
+    # Interrupt handlers stop whole CPUs: irq.pressure has no "some".
+    return totals.get("some", totals.get("full", 0)), totals.get("full", 0)
 
 
 def _read_stalled(path: Path) -> float:

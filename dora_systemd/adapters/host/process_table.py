@@ -74,6 +74,13 @@ def group_in(data: bytes) -> str:
     return next((line[3:] for line in lines if line.startswith("0::")), "")
 
 
+def process_group(pid: int, proc: Path = PROC) -> str:
+    """The cgroup of a process, "" if it has ended."""
+    with suppress(OSError):
+        return group_in(beginning(proc / str(pid) / "cgroup"))
+    return ""
+
+
 def _is_node(path: Path) -> bool:
     try:
         return b"\0DORA_NODE_CONFIG=" in b"\0" + beginning(path / "environ")

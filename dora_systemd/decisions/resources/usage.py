@@ -5,7 +5,10 @@ from typing import Any, NamedTuple
 
 from dora_systemd.values import INFINITY, SECOND
 
-RESOURCES = ("cpu", "memory", "io")
+RESOURCES = ("cpu", "memory", "io", "irq")
+"""Those of the kernel's "PSI" document; irq is the time that interrupt handlers took from a group,
+which kernels with CONFIG_IRQ_TIME_ACCOUNTING measure.
+"""
 WORTH_SHOWING = 1.0
 """Percent of the time from which on a wait is shown."""
 

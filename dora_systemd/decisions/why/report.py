@@ -25,6 +25,7 @@ from dora_systemd.decisions.why.remedies import (
 )
 from dora_systemd.decisions.why.stack import Frame
 from dora_systemd.decisions.why.verdict import Restart, Verdict
+from dora_systemd.decisions.why.waits import CpuWait, format_cpu_waits, wait_remedies
 from dora_systemd.names import release_of
 from dora_systemd.terminal_text import cut, one_line, wrapped
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
@@ -82,6 +83,7 @@ class Report:
     is_of_trial: bool = False  # words are of the trial that has failed, in which `undone` ended
     stack: tuple[Frame, ...] = ()  # of verdict.node, if a signal ended it
     keeps_core_dumps: bool = True  # whether this machine does
+    waits: tuple[CpuWait, ...] = ()  # of nodes that run, for a CPU
 
     @property
     def node(self) -> str:
@@ -124,6 +126,7 @@ def remedies(report: Report) -> list[str]:
         "host": host,
     }
     filled = [*filter(None, [hint]), *(text.format(**values) for text in texts if text)]
+    filled += wait_remedies(report.waits, subject.name)
     if report.is_held and verdict.is_away:
         again = f", then run: doractl restart {subject.name}"
         return [text.replace(again, ", and save it") for text in filled]
@@ -203,6 +206,7 @@ def _facts(report: Report) -> list[str]:
         "When": _when(verdict),
         "Machines": _machine_words(report.machines),
         "Memory": _memory_words(verdict.details),
+        "CPU": format_cpu_waits(report.waits),
         "Starved": ", ".join(verdict.starved),
         "Stopped": format_stopped(verdict.stopped),
         "Restarts": _restart_words(verdict.restarts),
@@ -348,6 +352,7 @@ def report_object(report: Report, row: DataflowRow) -> dict[str, Any]:
         "starved": list(verdict.starved),
         "undone": switch_object(report.subject.name, report.undone) if report.undone else None,
         "stack": [one._asdict() for one in report.stack],
+        "cpu_waits": [one.values() for one in report.waits],
         **_history(report),
         "remedies": remedies(report),
     }

@@ -20,7 +20,7 @@ from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.start.programs import version_warnings
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
-from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options, with_texts
 from tests.unit.fakes.programs import make_dora, make_program
 from tests.unit.verbs.start.test_programs import install
 from tests.unit.verbs.start.test_start import make_plan, place
@@ -152,6 +152,35 @@ def test_core_dumps_of_a_machine(manager: FakeManager, scope: Scope, tmp_path: P
     assert "core dumps" not in found(manager, scope)
     program.unlink()
     assert "not installed" in found(manager, scope)["core dumps"].text
+
+
+def test_interrupts_on_the_cpus_of_a_node(
+    manager: FakeManager, scope: Scope, tmp_path: Path
+) -> None:
+    device = tmp_path / "sys/devices/pci0/net/can0"
+    for path, text in {
+        tmp_path / "proc/interrupts": "  CPU0 CPU1\n 7: 5 0  PCI  0-edge  mcp251x\n",
+        tmp_path / "proc/irq/7/smp_affinity_list": "0-1",
+        tmp_path / "sys/devices/system/cpu/online": "0-1",
+        device / "irq": "7\n",
+        tmp_path / "sys/class/net/eth0": "",
+    }.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (tmp_path / "sys/class/net/can0").symlink_to(device)
+    manager.add(with_texts(options(), "arm:needs=net:can0", "arm:cpus=1"))
+    finding = found(manager, scope)["interrupts"]
+    words = "robot/arm: cpus 1 also have the interrupts of mcp251x (net:can0)"
+    assert (finding.state, finding.text) == (State.NOTE, words)
+    assert finding.remedy == "as root: echo 0 > /proc/irq/7/smp_affinity_list"
+
+
+def test_a_kernel_that_does_not_measure(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
+    (tmp_path / "proc/sys/kernel").mkdir(parents=True)
+    (tmp_path / "proc/sys/kernel/core_pattern").write_text("core\n")
+    assert found(manager, scope)["pressure"].remedy == "boot with psi=1"
+    (tmp_path / "proc/pressure").mkdir()
+    assert "pressure" not in found(manager, scope)
 
 
 def test_nodes_with_another_dora(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:

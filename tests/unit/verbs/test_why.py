@@ -13,7 +13,8 @@ from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.lives import now_boot
-from dora_systemd.verbs.why import explain, newest_failure, words_of_start
+from dora_systemd.verbs.why import explain, explain_now, newest_failure, words_of_start
+from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_program
@@ -182,3 +183,20 @@ def test_a_crash_has_its_stack(
     report = explain(manager, scope, "robot", JournalReader())
     assert [one.function for one in report.stack] == functions
     assert [one.text for one in report.words] == ["looking for a camera"]
+
+
+def test_who_had_the_cpu_only_now(
+    scope: ScopeIn, manager: FakeManager, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Not in a report for the gateway or a notice, which must not wait."""
+    group = fake_cgroups(monkeypatch, tmp_path) / "dora-robot.service"
+    (group / "node-camera").mkdir(parents=True)
+    (group / "node-camera/cpu.max").write_text("50000 100000\n")
+    (group / "node-camera/cpu.stat").write_text("usage_usec 9\nnr_periods 10\nnr_throttled 6\n")
+    (group / "node-camera/cpu.pressure").write_text("some avg10=0 avg60=0.0 avg300=0 total=1\n")
+    manager.add(options(), ControlGroup="/dora-robot.service")
+    journal = FakeJournal(monkeypatch, tmp_path)
+    journal.write(life_record("dataflow-started", 9, "robot", UUID, scope))
+    report = explain_now(manager, scope, "robot", JournalReader())
+    assert [(one.node, one.throttled) for one in report.waits] == [("camera", 60.0)]
+    assert explain(manager, scope, "robot", JournalReader()).waits == ()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.cgroup.strain import read_strain
+from dora_systemd.adapters.cgroup.strain import read_strain, read_waited
 from dora_systemd.decisions.resources.usage import Strain, format_waits, waits
 
 PSI = "some avg10=1.50 avg60=0.00 avg300=0.00 total=1500\n"
@@ -17,6 +17,18 @@ def test_control_files(tmp_path: Path) -> None:
     (tmp_path / "cpu.stat").write_text("usage_usec 9\nnr_periods 4\nthrottled_usec 33\n")
     (tmp_path / "memory.events").write_text("oom 2\noom_kill 3\n")
     assert read_strain(tmp_path) == Strain({"cpu": (1500, 0), "memory": (1500, 700)}, 33, 3)
+
+
+def test_time_that_interrupts_took(tmp_path: Path) -> None:
+    """irq.pressure has one line."""
+    (tmp_path / "irq.pressure").write_text(FULL)
+    assert read_strain(tmp_path).stalled == {"irq": (700, 700)}
+
+
+def test_waits_for_a_cpu_in_the_last_minute(tmp_path: Path) -> None:
+    assert read_waited(tmp_path) is None
+    (tmp_path / "cpu.pressure").write_text(PSI.replace("avg60=0.00", "avg60=31.25") + FULL)
+    assert read_waited(tmp_path) == 31.25
 
 
 def test_a_group_that_has_gone(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.logs.journal_events import ROLLED_BACK as BACK_EVENT
 from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, Switch
+from dora_systemd.decisions.resources.rivals import Rival
 from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import Happening
@@ -22,6 +23,7 @@ from dora_systemd.decisions.why.report import (
 )
 from dora_systemd.decisions.why.stack import NATIVE, PYTHON, Frame
 from dora_systemd.decisions.why.verdict import Restart, Verdict
+from dora_systemd.decisions.why.waits import CpuWait
 from dora_systemd.names import STORE, TREE
 from dora_systemd.values import SECOND
 
@@ -371,6 +373,17 @@ def test_where_it_crashed() -> None:
     assert "Where it crashed" not in format_report(FULL)
     found = report_object(replace(FULL, stack=FRAMES), ROW)["stack"]
     assert found[1] == {"language": "python", "function": "read", "place": "/home/camera.py:12"}
+
+
+def test_who_had_the_cpu() -> None:
+    rival = Rival(77, "st\x1b[2Jress", 97.2)
+    report = replace(FULL, waits=(CpuWait("camera", 31.2, cpus="2-3", rivals=(rival,)),))
+    text = format_report(report)
+    assert "  CPU:      camera waited 31% of the last minute for a CPU: cpus 2-3 also have" in text
+    assert "process 77 (st\\x1b[2Jress, 97%)" in text
+    assert remedies(report)[-1].startswith("keep other processes away from cpus 2-3: ")
+    (found,) = report_object(report, ROW)["cpu_waits"]
+    assert (found["node"], found["waited_percent"]) == ("camera", 31.2)
 
 
 @pytest.mark.parametrize(
