@@ -80,6 +80,10 @@ browser:  ## the status page in headless Chromium; LAB_OUT=DIR keeps pictures of
 	@$(PREPARE) container
 	@$(CHECK) browser
 
+openarm:  ## nodes of OpenArm from PyPI record a dataset, beside bare dora
+	@$(PREPARE) container
+	@$(CHECK) openarm
+
 machines:  ## three machines on a network: doractl -H, pulled cables, power cuts
 	@$(PREPARE) machines
 	@$(CHECK) machines
@@ -132,4 +136,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm emulator faults history stops power fuzz mutants browser machines bench bench-quick bookworm forky canary lint demo clean deb wheels autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm emulator faults history stops power fuzz mutants browser openarm machines bench bench-quick bookworm forky canary lint demo clean deb wheels autopkgtest

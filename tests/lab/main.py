@@ -15,6 +15,7 @@ from lab.errors import LabError
 from lab.image import ensure_tree
 from lab.machine import run_in_emulator, run_in_vm
 from lab.machines import run_in_machines
+from lab.openarm import ensure_openarm
 from lab.options import Options, parse_options
 from lab.platforms import ensure_platform
 from lab.process import need_root
@@ -85,6 +86,7 @@ ENSURE: dict[str, Callable[[Path], Path]] = {
     "emulator": ensure_snapshot,
     "rivals": ensure_rivals,
     "browser": ensure_browser,
+    "openarm": ensure_openarm,
     "machines": ensure_tree,
     **{suite: partial(ensure_platform, suite=suite) for suite in PLATFORMS},
 }
@@ -94,6 +96,7 @@ RUN = {
     "emulator": run_in_emulator,
     "rivals": run_in_container,
     "browser": run_in_container,
+    "openarm": run_in_container,
     "machines": run_in_machines,
     **dict.fromkeys(PLATFORMS, run_in_container),
 }

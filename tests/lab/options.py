@@ -9,7 +9,7 @@ from pathlib import Path
 from lab.definition import PLATFORMS
 from lab.errors import LabError
 
-FORMS = ("container", "vm", "emulator", *PLATFORMS, "rivals", "browser", "machines")
+FORMS = ("container", "vm", "emulator", *PLATFORMS, "rivals", "browser", "openarm", "machines")
 
 MACHINES = ("vm", "emulator")
 
@@ -26,6 +26,7 @@ environment:
   LAB=forky         a container with Debian forky, as bookworm: systemd 262, Python 3.14
   LAB=rivals        the container with supervisord, circus and pm2, for benchmarks
   LAB=browser       the container with Chromium, for the status page
+  LAB=openarm       the container with nodes of OpenArm from PyPI
   LAB=machines      three containers, a b c, on a network with sshd; the command runs in a
   LAB_OUT=DIR       this directory is /out inside
   DORA_LAB_CACHE    where images are kept (default: ~/.cache/dora-systemd-lab)

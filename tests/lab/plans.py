@@ -25,7 +25,8 @@ MUTMUT = "mutmut==3.8.1"
 # xdist would name its processes with it, and some tests look at their own command line.
 NOT_WITH_MUTMUT = "setproctitle"
 FAULTS = "tests/system/faults"
-NO_KERNEL = "not vm and not emulator"
+# System tests that need no image or kernel of their own.
+IN_CONTAINER = "not vm and not emulator and not openarm"
 # Containers at the same time. Most of the time of a test is waiting, and one more than three makes
 # two cores so busy that the tests wait for each other.
 CONTAINERS = 3
@@ -69,11 +70,12 @@ def plan_test(form: str) -> list[Step]:
     queue = [replace(one, after=(unit.name,)) for one in plan_system("container")]
     inside, *several = (replace(one, after=(unit.name,)) for one in (inside, *several))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
+    arm = replace(openarm_step(), after=(restarted.name,))
     oldest, newest = platform_step(OLD_SUITE, minutes=2), platform_step(NEW_SUITE, "-k", NEW)
     others = [*plan_lab(form), *plan_other_python(form), *plan_emulator(form)]
     lane = [build, packages_step(), wheels_step(), oldest, newest, *others]
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
-    return [unit, *several, *in_a_row(lane, unit), inside, restarted, *queue]
+    return [unit, *several, *in_a_row(lane, unit), inside, restarted, arm, *queue]
 
 
 def in_a_row(steps: Sequence[Step], first: Step) -> list[Step]:
@@ -189,7 +191,7 @@ def platform_step(suite: str, *options: str, minutes: int = 1) -> Step:
 
 def plan_system(form: str) -> list[Step]:
     here = " and not lab" if form == "host" else ""
-    arguments = ["tests/system", "-m", f"{NO_KERNEL}{here}"]
+    arguments = ["tests/system", "-m", f"{IN_CONTAINER}{here}"]
     if form == "container":
         return queue_steps("system tests", "browser", arguments, minutes=14)
     if form != "host":
@@ -207,6 +209,15 @@ def plan_browser(_form: str) -> list[Step]:
     return [lab_step("status page in a browser", "browser", arguments, minutes=1)]
 
 
+def plan_openarm(_form: str) -> list[Step]:
+    return [openarm_step()]
+
+
+def openarm_step() -> Step:
+    arguments = ["tests/system", "-m", "openarm"]
+    return lab_step("nodes of OpenArm from PyPI", "openarm", arguments, minutes=1)
+
+
 def plan_machines(_form: str) -> list[Step]:
     return machines_steps()
 
@@ -219,7 +230,7 @@ def machines_steps() -> list[Step]:
 def plan_faults(form: str) -> list[Step]:
     """Every fault as often as ROUNDS says; a machine of its own, and nothing beside it."""
     rounds = os.environ.get("ROUNDS") or "1"
-    marks = "vm" if form in MACHINES else NO_KERNEL
+    marks = "vm" if form in MACHINES else IN_CONTAINER
     command = ["tests/lab/lab", "run", "--env", f"FAULT_ROUNDS={rounds}", "--", *installed(form)]
     command += ["pytest", FAULTS, "-m", marks]
     step = Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))
@@ -287,7 +298,7 @@ def plan_quick(form: str) -> list[Step]:
     """The heart of the system tests; on another Debian, with the packages."""
     files = [f"tests/system/test_{name}.py" for name in QUICK]
     where = form if form in PLATFORMS else "container"
-    steps = queue_steps("quick system tests", where, [*files, "-m", NO_KERNEL])
+    steps = queue_steps("quick system tests", where, [*files, "-m", IN_CONTAINER])
     return [*packages_for(form), *steps]
 
 
@@ -364,6 +375,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "packages": plan_packages,
     **{suite: partial(plan_platform, suite=suite) for suite in PLATFORMS},
     "browser": plan_browser,
+    "openarm": plan_openarm,
     "machines": plan_machines,
     "lint": plan_lint,
 }
