@@ -44,6 +44,8 @@ class CellPaths:
         """The socket where the runner answers doractl, and relays to the coordinator."""
         self.times = root / "times"
         """The times of the last messages of owed outputs, see decisions/owes/probe.py."""
+        self.ring = root / "ring.sock"
+        """The socket that hands out the memory of the recorder, see runner/recorder/."""
         self.settings = root / "settings.yml"
         """The version of the dataflow's settings file that is in use."""
         self.lock = root / "inhibit.lock"

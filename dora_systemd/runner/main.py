@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Coroutine
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.dora.check import DoraCheck
 from dora_systemd.adapters.dora.control import read_coordinator
@@ -69,6 +69,9 @@ from dora_systemd.runner.reload.swap import Swapper
 from dora_systemd.runner.requests import NodeRequests, Recheck, end_held
 from dora_systemd.values import INFINITY, SECOND
 
+if TYPE_CHECKING:
+    from dora_systemd.runner.recorder.keep import Rings
+
 SAMPLE_SECONDS = 5.0
 JOURNAL_SECONDS = 1.0
 CLOSE_SECONDS = 7.0
@@ -92,6 +95,7 @@ async def run_cell(
     # systemd holds the pipes too, so their content survives a kill of this process.
     this_life = begin_life(options, paths.is_of_user)
     spent = find_spent(options, paths)
+    ring = fd_store.inherited_ring()
     fd_store.forget_inherited()
     origin = Origin(options.name, options.uuid)
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
@@ -100,6 +104,8 @@ async def run_cell(
             raise spent
         pipes.write_event("dataflow-starting")
         runs = Runs(given, options, paths, pipes, clock, begun, this_life)
+        if ring >= 0 or options.has("record"):
+            runs.keep_ring(ring)
         return await live(runs, losses_of_user(journal, pipes) if paths.is_of_user else None)
     except DoraSystemdError as error:
         cause = Cause.RESTARTS_SPENT if error is spent else Cause.BAD_DATAFLOW
@@ -152,6 +158,16 @@ class Runs:
         self.nodes = Nodes(self.unit, paths, pipes, watchdogs_of(self.role.own(options)))
         self.beside = Beside(asyncio.get_running_loop())
         self.check = begun[1] if begun else DoraCheck(options, self.environment)
+        self.rings: Rings | None = None
+
+    def keep_ring(self, inherited: int) -> None:
+        """Keep the ring of the recorder, or give back one that is not needed. inherited: or -1."""
+        # Imported late: few dataflows have a recorder.
+        from dora_systemd.runner.recorder.keep import Rings
+
+        self.rings = Rings(inherited)
+        if self.role.options.of_dataflow("record") is None:
+            self.rings.free()
 
 
 def role_of(options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> Alone:
@@ -278,6 +294,10 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             from dora_systemd.runner.owes.watch import watch_owes
 
             dialogue.spawn("watch what nodes owe", watch_owes(run, prepared, dora, dialogue))
+        if runs.rings is not None and options.of_dataflow("record") is not None:
+            from dora_systemd.runner.recorder.keep import keep_recorder
+
+            dialogue.spawn("record", keep_recorder(run, prepared, dora, runs.rings))
         runs.beside.attach(pump.push)
         try:
             await pump.end

@@ -62,6 +62,10 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
         from dora_systemd.adapters.dora.probe import probe_python
 
         probe_python(plan)
+    if options.has("record"):
+        from dora_systemd.adapters.dora.recorder import check_recorder
+
+        check_recorder(plan)
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
 
 

@@ -18,18 +18,20 @@ sys.exit(1) if spec is None or spec.origin is None else print(sys.executable)
 """Prints the interpreter if it has the module. It does not import it, which takes longer."""
 
 
-def probe_python(plan: LaunchPlan, module: str = "dora") -> str:
+def probe_python(
+    plan: LaunchPlan, module: str = "dora", purpose: str = "watch what nodes owe"
+) -> str:
     """The absolute path of a Python with dora-rs: that of the nodes, else that of the runner.
 
-    module: the name by which nodes import dora-rs. Blocks for some 20 ms. Raises DoraSystemdError
-    (BAD_INPUT) if there is none.
+    module: the name by which nodes import dora-rs. purpose: for the error. Blocks for some 20 ms.
+    Raises DoraSystemdError (BAD_INPUT) if there is none.
     """
     for command in _interpreters(plan):
         if found := _with_module(command, plan, module):
             return found
     python = " ".join(next(_interpreters(plan)))
     raise DoraSystemdError(
-        f"cannot watch what nodes owe: {python} has no dora-rs",
+        f"cannot {purpose}: {python} has no dora-rs",
         "run: pip install dora-rs there, or give another environment with --venv",
         ExitCode.BAD_INPUT,
     )

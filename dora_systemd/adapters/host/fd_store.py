@@ -14,6 +14,8 @@ PREFIX = "dora-log-"
 """Prefix of the names of pipes; the rest is the node, so that they can be removed by node."""
 LIFE = "dora-life"
 """Name of a descriptor that stands for one life of the runner since the last quiet window."""
+RING = "dora-ring"
+"""Name of the memory that has the last messages of the nodes, see decisions/recorder/."""
 _MOST_DIGITS = 32
 _FIRST = 3  # SD_LISTEN_FDS_START, see sd_listen_fds(3)
 
@@ -30,6 +32,24 @@ def forget(node: str) -> None:
 
 def _forget(name: str) -> None:
     _send(f"FDSTOREREMOVE=1\nFDNAME={name}", [])
+
+
+def store_ring(fd: int) -> None:
+    """Have systemd keep the ring of the recorder."""
+    _send(f"FDSTORE=1\nFDNAME={RING}\nFDPOLL=0", [fd])
+
+
+def forget_ring() -> None:
+    """Have systemd close the ring of the recorder."""
+    _forget(RING)
+
+
+def inherited_ring() -> int:
+    """The descriptor of the ring that an earlier life has left, or -1."""
+    rings = _inherited(RING)
+    for fd in rings:
+        os.set_inheritable(fd, False)
+    return rings[-1] if rings else -1
 
 
 def lives() -> int:
@@ -55,10 +75,14 @@ def _read_time(fd: int) -> int:
 
 def _lives() -> list[int]:
     """The inherited descriptors that stand for a life."""
+    return _inherited(LIFE)
+
+
+def _inherited(wanted: str) -> list[int]:
     if os.environ.get("LISTEN_PID", "") != str(os.getpid()):
         return []
     names = os.environ.get("LISTEN_FDNAMES", "").split(":")
-    return [fd for fd, name in enumerate(names, _FIRST) if name == LIFE]
+    return [fd for fd, name in enumerate(names, _FIRST) if name == wanted]
 
 
 def count_life(began_us: int) -> None:

@@ -50,6 +50,7 @@ MODULES = {
     "on_failure": "on_failure",
     "oom_score_adjust": "rights",
     "owes": "owes",
+    "record": "record",
     "replace": "reload",
     "restart_delay": "restarts",
     "restart_policy": "restarts",

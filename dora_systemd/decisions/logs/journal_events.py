@@ -91,6 +91,9 @@ EVENTS = {
     "outputs-unwatched": _dataflow(
         "363dd20a3ce94006a65ba740609decd3", WARNING, "has owed outputs that nobody watches"
     ),
+    "outputs-unrecorded": _dataflow(
+        "cf425f10f51b4fcfb93a10956310c0d0", WARNING, "has outputs that nobody records"
+    ),
     "coordinator-lost": EventKind(
         "11b7330be3fb484584286f274012f05a", ERR, "The coordinator of dataflow {dataflow} is lost"
     ),

@@ -12,7 +12,6 @@ owed output, in their order, and for each other input of the nodes that owe them
 itself, is starved.
 """
 
-import shlex
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,15 +19,10 @@ from typing import Any
 
 from dora_systemd.decisions.cell.owes import PROBE, Owed
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, downstream_of
+from dora_systemd.decisions.owes.extra_node import extra_definition
 from dora_systemd.values import SECOND
 
 _SLOT = struct.Struct("=Q")
-_VARIABLES = {
-    # One thread of dora's is enough for it. Each further one has an arena of malloc(3).
-    "TOKIO_WORKER_THREADS": "1",
-    "MALLOC_ARENA_MAX": "1",
-    "RUST_LOG": "error",
-}
 
 
 def probe_definition(
@@ -42,17 +36,8 @@ def probe_definition(
     number: of earlier probes in this run. command: the program. launcher: what executes the
     program. inputs: the outputs to receive, NODE/OUTPUT, each with its slot in the file of times.
     """
-    interpreter, script = launcher
-    return {
-        "id": f"{PROBE}.{number}",
-        "path": interpreter,
-        "args": shlex.join([script, PROBE, "/", "keep", *command]),
-        "inputs": {f"{at}": {"source": one, "queue_size": 1} for at, one in inputs},
-        "env": dict(_VARIABLES),
-        "restart_policy": "never",
-        "max_log_size": "64KB",
-        "max_rotated_files": 1,
-    }
+    own = {f"{at}": {"source": one, "queue_size": 1} for at, one in inputs}
+    return extra_definition(PROBE, number, command, launcher, own, {})
 
 
 def size_of_times(slots: int) -> int:

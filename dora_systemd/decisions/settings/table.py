@@ -26,6 +26,7 @@ from dora_systemd.decisions.settings.machines import MACHINE_SETTINGS
 from dora_systemd.decisions.settings.needs import NEED_SETTINGS
 from dora_systemd.decisions.settings.on_failure import NOTICE_SETTINGS
 from dora_systemd.decisions.settings.owes import OWES_SETTINGS, SIGN_SETTINGS
+from dora_systemd.decisions.settings.record import RECORD_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.rights import RIGHTS_SETTINGS
@@ -108,6 +109,7 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     "Signs of life": SIGN_SETTINGS,
     "Owed outputs": OWES_SETTINGS,
     "Notice of a failure": NOTICE_SETTINGS,
+    "Recorder": RECORD_SETTINGS,
     "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),
     "Hot reload": RELOAD_SETTINGS,
     "Machines": MACHINE_SETTINGS,

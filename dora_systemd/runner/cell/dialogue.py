@@ -20,6 +20,7 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.node_table import held, lacking, with_process
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.decisions.recorder.record import is_recorder
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.clock import Gaps
 from dora_systemd.runner.cell.engine import Engine
@@ -168,7 +169,8 @@ class Dialogue(Tasks):
 
     def _is_own(self, node: str) -> bool:
         """Whether this runner has added the node, which the dataflow does not contain."""
-        return self._options.has("owes") and is_probe(node)
+        has = self._options.has
+        return (has("owes") and is_probe(node)) or (has("record") and is_recorder(node))
 
     def _hear(self, record: protocol.LogRecord) -> None:
         if self._is_own(record.node):

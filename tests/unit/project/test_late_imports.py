@@ -88,12 +88,13 @@ LATE = {
     "most dataflows owe nothing, wait for nothing, never restarted, and run on one machine": {
         "adapters.dora.preparation": {
             *("adapters.dora.probe", "decisions.machines.part", "decisions.settings.runner"),
+            "adapters.dora.recorder",
         },
         "runner.main": {
             "runner.cell.notices",
             *("runner.machines.head", "runner.machines.member", "runner.needs"),
             "runner.cell.node_stops",
-            "runner.owes.watch",
+            *("runner.owes.watch", "runner.recorder.keep"),
         },
         "verbs.facts.reading": {
             *("decisions.machines.usage", "decisions.owes.probe"),
@@ -102,6 +103,7 @@ LATE = {
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},
+        "runner.recorder.record": {"dora", "pyarrow", "decisions.recorder.writer"},
     },
     "most dataflows run on one machine and have no releases, and most links are not lost": {
         "cli.foreground": {"verbs.facts.machines", "verbs.remote.attached"},

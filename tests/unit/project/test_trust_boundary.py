@@ -82,6 +82,7 @@ _TABLE = {
         adapters.host.presence runner.requests runner.needs runner.nodes.launcher_gates
         runner.cell.engine runner.cell.notices runner.cell.pump runner.machines.head
         runner.machines.roster runner.main runner.nodes.nodes
+        runner.recorder.keep runner.recorder.record runner.recorder.ring_file
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
     OTHERWISE: """

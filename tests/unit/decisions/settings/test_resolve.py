@@ -11,6 +11,7 @@ from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
+from dora_systemd.decisions.recorder.record import Record
 from dora_systemd.decisions.reload.changes import REPLACE_WORDS
 from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
 from dora_systemd.decisions.settings.machines import Declared
@@ -220,6 +221,7 @@ def test_values_and_back(data: st.DataObject) -> None:
         "stop_limit": st.integers(0, 2**60),
         "stop": st.builds(NodeStop, st.just(""), st.integers(1, 2**60), st.just(("arm", "cam"))),
         "on_failure": st.just(("/bin/x", "a b", "$c")) | st.just(("unit:tell@.service",)),
+        "record": st.sampled_from([None, Record(), Record(SECOND, 1 << 20, 0, ("cam/image",))]),
         "owes": st.just((Owed("cam", "image", 2 * SECOND),)) | st.just(()),
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))

@@ -1,0 +1,156 @@
+"""The setting `record`: which last messages of the outputs are kept, and in how much memory.
+
+The setting is in decisions/settings/record.py.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from dora_systemd.decisions.cell.machines import placed_on
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import did_you_mean
+from dora_systemd.values import (
+    INFINITY,
+    SECOND,
+    format_duration,
+    format_size,
+    parse_bool,
+    parse_duration,
+    parse_size,
+    quoted,
+)
+
+RECORDER = "dora-systemd-recorder"
+"""The beginning of dora's id of the recorder; its cgroup is node-RECORDER."""
+KEYS = ("last", "memory", "after", "outputs")
+MEGABYTE = 1024 * 1024
+ROOM = 160 * MEGABYTE
+"""Bytes that the recorder uses besides the ring: Python, pyarrow and the messages on their way."""
+_SHORTEST, _LEAST = SECOND, MEGABYTE
+_FORM = "last=30s,memory=200M,after=2s,outputs=NODE/OUTPUT+NODE/OUTPUT"
+_HINT = f"write {_FORM}, any of these keys; yes or no"
+
+
+class Record(NamedTuple):
+    """What the recorder keeps."""
+
+    last: int = 10 * SECOND  # µs of messages before the last one of each output
+    memory: int = 32 * MEGABYTE  # bytes of all messages
+    after: int = 2 * SECOND  # µs after a failure that the file contains, too
+    # those to record, NODE/OUTPUT; empty: all, but of large messages only the last one
+    outputs: tuple[str, ...] = ()
+
+
+def parse_record(text: str) -> Record | None:
+    """The inverse of format_record; keys may be left out. Raises DoraSystemdError (USAGE)."""
+    if "=" not in text:
+        try:
+            return Record() if parse_bool(text) else None
+        except DoraSystemdError as error:
+            raise _wrong(f"{quoted(text)} is none", _HINT) from error
+    pairs = [part.partition("=") for part in text.split(",")]
+    values = {key.strip(): value for key, equals, value in pairs if equals}
+    if len(values) != len(pairs):
+        raise _wrong(f"{quoted(text)} is none", _HINT)
+    names = values.pop("outputs", "")
+    return record_of(values, names.split("+") if names else ())
+
+
+def record_of(values: Mapping[str, str], outputs: Sequence[str] = ()) -> Record:
+    """The value from its KEYS as texts. Raises DoraSystemdError (USAGE)."""
+    for key in values:
+        if key not in KEYS:
+            raise _wrong(
+                f"unknown key {quoted(key)}",
+                did_you_mean(key, KEYS) or f"valid keys: {', '.join(KEYS)}",
+            )
+    default = Record(outputs=tuple(dict.fromkeys(map(_output, outputs))))
+    return default._replace(
+        last=_time("last", values["last"]) if "last" in values else default.last,
+        memory=_memory(values["memory"]) if "memory" in values else default.memory,
+        after=_time("after", values["after"]) if "after" in values else default.after,
+    )
+
+
+def _output(text: str) -> str:
+    name = text.strip()
+    node, _, output = name.partition("/")
+    if not node or not output or not name.isprintable():
+        raise _wrong(f"{quoted(text)} is no output", "write NODE/OUTPUT, such as camera/image")
+    return name
+
+
+def _time(key: str, text: str) -> int:
+    time, least = parse_duration(text), _SHORTEST if key == "last" else 0
+    if not least <= time < INFINITY:
+        raise _wrong(f"{key} is {quoted(text)}", "write a time such as 30s, of a second or more")
+    return time
+
+
+def _memory(text: str) -> int:
+    size = parse_size(text)
+    if not _LEAST <= size < INFINITY:
+        raise _wrong(f"memory is {quoted(text)}", "write a size such as 200M, of 1M or more")
+    return size
+
+
+def _wrong(reason: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot read what to record: {reason}", hint, ExitCode.USAGE)
+
+
+def format_record(record: Record | None) -> str:
+    """Format for the runner's command line."""
+    if record is None:
+        return "no"
+    last, after = format_duration(record.last), format_duration(record.after)
+    names = f",outputs={'+'.join(record.outputs)}" if record.outputs else ""
+    return f"last={last},memory={format_size(record.memory)},after={after}{names}"
+
+
+def is_recorder(node: str) -> bool:
+    """Whether dora's node id is that of a recorder."""
+    return node.startswith(RECORDER)
+
+
+def check_record(record: Record | None, options: RunnerOptions, nodes: Sequence[Node]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for an output that no node has. nodes: expanded."""
+    if record is None:
+        return
+    by_id = {node.id: node for node in nodes}
+    known = sorted(f"{node.id}/{output}" for node in nodes for output in node.outputs)
+    for name in record.outputs:
+        node = by_id.get(name.partition("/")[0])
+        # ros2 nodes get outputs from their topics.
+        if name not in known and (node is None or node.kind is not NodeKind.ROS2):
+            hint = did_you_mean(name, known) or f"outputs: {', '.join(known) or 'none'}"
+            raise _impossible(f"cannot record {quoted(name)}: no such output", hint)
+        if machine := placed_on(options.placed, name.partition("/")[0]):
+            hint = "only outputs of nodes on the machine of the dataflow's unit can be recorded"
+            raise _impossible(f"cannot record {quoted(name)}: it is on machine {machine}", hint)
+    for one in filter(is_recorder, by_id):
+        message = f"cannot record outputs: the node {quoted(one)} has a name that doractl needs"
+        raise _impossible(message, "give that node another id")
+
+
+def check_memory(record: Record, total: int) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) if the machine has no such memory. total: its bytes."""
+    if record.memory + ROOM > total:
+        has = f"this machine has {format_size(total // MEGABYTE * MEGABYTE)}"
+        own = f"{format_size(record.memory)} and {format_size(ROOM)} for the recorder"
+        raise _impossible(f"cannot record in {own}: {has}", "lower memory: of record")
+
+
+def recorded_outputs(
+    record: Record, options: RunnerOptions, nodes: Sequence[Node]
+) -> tuple[str, ...]:
+    """The outputs to record: those that are named, else all of the nodes on this machine."""
+    if record.outputs:
+        return record.outputs
+    here = (node for node in nodes if not placed_on(options.placed, node.id))
+    return tuple(sorted(f"{node.id}/{output}" for node in here for output in node.outputs))
+
+
+def _impossible(message: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

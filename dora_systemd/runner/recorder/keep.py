@@ -1,0 +1,158 @@
+"""Keeps one recorder among the nodes of a run, and the ring that it writes to."""
+
+import asyncio
+import hashlib
+import os
+import socket
+from collections.abc import Awaitable, Callable
+from contextlib import closing, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
+from dora_systemd.adapters.dora.recorder import recorder_python
+from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.owes.extra_node import extra_definition
+from dora_systemd.decisions.recorder.record import RECORDER, ROOM, Record, recorded_outputs
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.owes.extra_node import ExtraNode, can_come
+from dora_systemd.runner.recorder.ring_file import (
+    RingSocket,
+    fitted_ring,
+    free_ring,
+    header_of,
+)
+from dora_systemd.runner.reload.apply import Run
+from dora_systemd.values import SECOND
+
+FindPython = Callable[[], Awaitable[str]]
+
+QUEUE = 30
+"""Messages of an output that wait for the recorder; more would hold shared memory of the node."""
+_TICK = SECOND
+_LONGEST_PAUSE = 8 * SECOND
+"""µs in which nothing is recorded, if recorders end again and again."""
+_WEIGHT = 10
+"""cpu.weight; other groups have 100."""
+_VARIABLES = {"RUST_LOG": "warn"}
+"""dora prints which messages it drops."""
+
+
+class Rings:
+    """The ring of a dataflow, which outlasts runs. fd: of the earlier life, or -1."""
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd
+
+    def free(self) -> None:
+        """Give the memory back."""
+        free_ring(self.fd)
+        self.fd = -1
+
+
+async def keep_recorder(run: Run, prepared: Prepared, dora: Engine, rings: Rings) -> None:
+    """Record what the options of `prepared` name, from the start of all nodes on."""
+    options = prepared.plan.options
+    record = options.of_dataflow("record")
+    await run.pump.wait(lambda cell: cell.state is State.RUNNING, None)
+    find_python = partial(asyncio.to_thread, recorder_python, prepared.plan)
+    outputs = recorded_outputs(record, options, prepared.dataflow.nodes)
+    if not outputs:
+        return
+    try:
+        rings.fd = fitted_ring(rings.fd, header_of(record, outputs, _facts(options)))
+        ring = RingSocket(run.nodes.places[1].ring, rings.fd)
+    except (OSError, DoraSystemdError) as error:
+        reason = error.message if isinstance(error, DoraSystemdError) else error.strerror
+        run.pipes.write_event("outputs-unrecorded", reason=f"{reason}")
+        return
+    with closing(ring):
+        await Recorder(run, dora, prepared.plan, record, outputs, find_python).work()
+
+
+def _facts(options: RunnerOptions) -> dict[str, str]:
+    """The origin of the messages, for the file that is made of the ring."""
+    facts = {"dataflow": options.name, "uuid": options.uuid, "host": socket.gethostname()}
+    with suppress(OSError):
+        facts["boot"] = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        facts["descriptor"] = hashlib.sha256(Path(options.dataflow).read_bytes()).hexdigest()
+    return {**facts, "invocation": os.environ.get("INVOCATION_ID", "")}
+
+
+class Recorder:
+    """The recorder of one run. outputs: of the ring, in its order. find_python: see Probe."""
+
+    def __init__(
+        self,
+        run: Run,
+        dora: Engine,
+        plan: LaunchPlan,
+        record: Record,
+        outputs: tuple[str, ...],
+        find_python: FindPython,
+    ) -> None:
+        self._run, self._plan, self._record = run, plan, record
+        self._outputs, self._find_python = outputs, find_python
+        self._node = ExtraNode(run, dora, RECORDER, _LONGEST_PAUSE)
+        self._is_told = False
+
+    async def work(self) -> None:
+        """Keep a recorder running."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await self._tend(int(loop.time() * SECOND))
+            await asyncio.sleep(_TICK / SECOND)
+
+    async def _tend(self, now: int) -> None:
+        inputs = self._inputs()
+        if self._node.is_there:
+            if not inputs:
+                self._node.kill()  # the dataflow would not finish without it
+            elif self._node.rest(now):
+                self._is_told = False
+        elif inputs and self._node.is_due(now):
+            if self._node.ends_early:
+                self._tell("the recorder ended again and again")
+            if reason := await self._node.add(now, partial(self._define, inputs)):
+                self._tell(reason)
+
+    def _inputs(self) -> dict[str, dict[str, Any]]:
+        """The outputs of nodes that run or may start again."""
+        nodes = self._run.pump.cell.nodes
+        return {
+            f"{at}": {"source": one, "queue_size": QUEUE}
+            for at, one in enumerate(self._outputs)
+            if can_come(nodes.get(one.partition("/")[0]))
+        }
+
+    async def _define(self, inputs: dict[str, dict[str, Any]]) -> dict[str, Any]:
+        python, node = await self._find_python(), self._node
+        self._limit()
+        script = PACKAGE / "runner" / "recorder" / "record.py"
+        path = self._run.nodes.places[1].ring
+        command = [python, "-u", str(script), str(path), str(PACKAGE)]
+        node.count += 1
+        launcher = PERL, self._plan.launcher
+        return extra_definition(RECORDER, node.count, command, launcher, inputs, _VARIABLES)
+
+    def _limit(self) -> None:
+        """Limit the group, as far as the kernel can: some containers have no controllers."""
+        limits = {
+            "memory.max": str(self._record.memory + ROOM),
+            "memory.swap.max": "0",
+            "cpu.weight": str(_WEIGHT),
+        }
+        for file, text in limits.items():
+            with suppress(OSError):
+                cgroup.write_text(self._node.group / file, text)
+
+    def _tell(self, reason: str) -> None:
+        """Report that nothing is recorded, once until a recorder has run for a while."""
+        if not self._is_told and self._run.pump.cell.state is State.RUNNING:
+            self._is_told = True
+            self._run.pipes.write_event("outputs-unrecorded", reason=reason)

@@ -1,0 +1,166 @@
+"""The recorder with real dora and systemd: what its ring has after everything has died."""
+
+import contextlib
+import io
+import json
+import os
+import random
+import signal
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.recorder.reading import Reading, Recorded
+from dora_systemd.decisions.recorder.recording import write_recording
+from tests.system.cells import Cell, Project, wait_for
+from tests.unit.fakes.recorder.mcap import File
+
+CAMERA = """
+import os, time
+from dora import Node
+import pyarrow as pa
+node = Node()
+at = 0
+for event in node:
+    if event["type"] == "INPUT":
+        at += 1
+        node.send_output("image", pa.array([at] * 50_000, type=pa.int64()), {"width": 5})
+        node.send_output("count", pa.array([at]))
+        print(at, flush=True)
+"""
+FLOW = """
+nodes:
+  - {id: camera, path: camera.py, inputs: {tick: dora/timer/millis/20}, outputs: [image, count]}
+"""
+
+
+LARGE = "dora-rs/dora#2742"
+"""A diagnosis of dora about each output with large messages."""
+
+
+class Ring:
+    """The ring that systemd keeps."""
+
+    def __init__(self) -> None:
+        self.fd = -1
+        for one in Path("/proc/1/fd").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # PID 1 closes others at any moment
+                if "memfd:dora-ring" in str(one.readlink()):
+                    self.fd = os.open(one, os.O_RDONLY)
+
+    def read(self, at: int, size: int) -> bytes:
+        return os.pread(self.fd, size, at)
+
+    def reading(self) -> Reading:
+        assert self.fd >= 0
+        return Reading(self, os.fstat(self.fd).st_size, 1 << 30)
+
+    def messages(self) -> list[Recorded]:
+        return list(self.reading().messages()) if self.fd >= 0 else []
+
+    def last(self) -> int:
+        """The number of the last message."""
+        found = self.messages()
+        return found[-1].head.number if found else 0
+
+    @property
+    def used(self) -> int:
+        return os.fstat(self.fd).st_blocks * 512
+
+
+def flow(project: Project, record: Any) -> Path:
+    project.write("camera.py", CAMERA)
+    project.write("flow.systemd.yml", json.dumps({"record": record}))
+    return project.write("flow.yml", FLOW)
+
+
+def file_of(ring: Ring) -> File:
+    """The file of the ring, which is read strictly."""
+    out = io.BytesIO()
+    write_recording(ring.reading(), out.write, {})
+    return File(out.getvalue())
+
+
+@pytest.mark.warns(LARGE)
+def test_by_default_the_last_message_of_all_outputs_and_more_of_small_ones(
+    cell: Cell, project: Project
+) -> None:
+    cell.start(flow(project, True))
+    wait_for("messages are recorded", lambda: len(Ring().messages()) > 100)
+    ring = Ring()
+    file = file_of(ring)
+    counts = [one.topic for one in file.messages]
+    assert (counts.count("camera/image"), counts.count("camera/image#metadata")) == (1, 1)
+    assert counts.count("camera/count") > 90
+    assert next(one for one in file.messages if one.encoding == "json").data == b'{"width": 5}'
+    assert dict(file.metadata)["dora-systemd"]["dataflow"] == cell.name
+    assert ring.used < 1024 * 1024
+    assert "dora-systemd-recorder" not in cell.doractl("list", cell.name).stdout
+    cell.doractl("stop", cell.name)
+    assert Ring().fd < 0, "its memory is free"
+
+
+@pytest.mark.warns(LARGE)
+def test_named_outputs_in_their_memory(cell: Cell, project: Project) -> None:
+    cell.start(flow(project, {"memory": "4M", "outputs": ["camera/image"]}))
+    wait_for("it is full", lambda: Ring().fd >= 0 and Ring().reading().states[0].evicted > 20)
+    assert list(Ring().reading().header.outputs) == ["camera/image"]
+    assert 8 <= len(file_of(Ring()).messages) // 2 <= 10
+    assert Ring().used <= 4.2 * 1024 * 1024
+
+
+def test_what_cannot_be_recorded(cell: Cell, project: Project) -> None:
+    path = flow(project, {"outputs": ["camera/imge"]})
+    for flags, words in (
+        ((), "cannot record 'camera/imge': no such output"),
+        (("--record", "memory=100T"), "cannot record in 100T and 160M for the recorder: "),
+        (("--record", "memory=5"), "cannot read what to record: memory is '5'"),
+        (("--record", "lst=5s"), "cannot read what to record: unknown key 'lst'"),
+    ):
+        done = cell.doractl("start", str(path), *flags, check=False)
+        assert words in done.stderr
+        assert done.returncode in (2, 5), done.stderr
+
+
+ROUNDS = int(os.environ.get("KILLS", "4"))
+KILLED = (
+    *("killed", "signal", "SIGKILL", "is lost", "failed", "crashed", "restart"),
+    *("exited with error", "Failed with result", "nobody records", LARGE, "connection"),
+)
+
+
+def has_more(last: int) -> bool:
+    return Ring().last() > last
+
+
+def victim(cell: Cell, who: str) -> int:
+    """The process to kill, 0 if it does not run."""
+    if who == "recorder":
+        return next(iter(cell.pids("node-dora-systemd-recorder")), 0)
+    if who == "node":
+        return cell.status.nodes["camera"].pid
+    return cell.supervisor_pid(who)
+
+
+@pytest.mark.warns(*KILLED)
+@pytest.mark.parametrize("who", ["recorder", "node", "daemon", "runner"])
+def test_after_a_kill_it_is_all_there(cell: Cell, project: Project, who: str) -> None:
+    path = flow(project, {"memory": "8M", "outputs": ["camera/image", "camera/count"]})
+    words = "--restart-policy", "on-failure", "--max-restarts", "100000", "--restart-delay", "500ms"
+    cell.start(path, *words)
+    last, seed = 0, random.Random(who)
+    for _ in range(ROUNDS):
+        more = last + seed.randrange(10, 40)
+        wait_for("it records", partial(has_more, more))
+        pid = wait_for("it runs", lambda: victim(cell, who))
+        before = Ring().last()
+        os.kill(pid, signal.SIGKILL)
+        ring = Ring()
+        reading = ring.reading()
+        messages = list(reading.messages())
+        last = messages[-1].head.number
+        received = sum(one.received for one in reading.states)
+        assert (last >= before, received - last in (0, 1), reading.damaged) == (True, True, 0)
+        file_of(ring)
