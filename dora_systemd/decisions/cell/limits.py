@@ -25,7 +25,7 @@ from dora_systemd.values import (
 )
 
 if TYPE_CHECKING:  # `list` loads this module, and needs no options
-    from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
+    from dora_systemd.decisions.cell.options import RunnerOptions
 
 SMALLEST_MEMORY = 1024 * 1024
 """Bytes. A smaller value is a missing suffix: no program runs in so little memory."""
@@ -137,13 +137,6 @@ class NodeLimits(NamedTuple):
         return {BY_WORD[word].file: BY_WORD[word].file_text(value) for word, value in self.limits}
 
 
-class SettingsChange(NamedTuple):
-    """Changes of a settings file."""
-
-    limits: tuple[NodeLimits, ...]  # those of nodes
-    others: tuple[str, ...]  # keys that take effect at the next start
-
-
 def node_limits(node: str, limits: Mapping[str, int]) -> NodeLimits:
     """The limits of `node`, by word."""
     return NodeLimits(node, tuple((word, limits[word]) for word in BY_WORD if word in limits))
@@ -193,17 +186,6 @@ def limits_of(options: "RunnerOptions") -> tuple[NodeLimits, ...]:
         node_limits(node, {word: own[node] for word, own in found.items() if node in own})
         for node in named
     )
-
-
-def limit_texts(limits: Iterable[NodeLimits]) -> "list[SettingText]":
-    """The limits as settings of the runner."""
-    from dora_systemd.decisions.cell.options import SettingText
-
-    return [
-        SettingText(one.node, BY_WORD[word].key, BY_WORD[word].format(value))
-        for one in limits
-        for word, value in one.limits
-    ]
 
 
 def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Iterable[str]) -> None:

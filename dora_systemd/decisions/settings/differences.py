@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, SettingsChange, node_limits
+from dora_systemd.decisions.cell.limits import BY_KEY
+from dora_systemd.decisions.cell.options import SettingText
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.resolve import Settings, runner_texts
 from dora_systemd.decisions.settings.table import ENV, PROPERTY, SETTINGS, WORKING_DIRECTORY
@@ -12,10 +13,16 @@ from dora_systemd.values import INFINITY
 _USUAL_WEIGHT = 100
 
 
-def settings_change(before: Settings, after: Settings) -> SettingsChange:
-    """The settings in `after`, made from one file only, that differ from `before`."""
-    old, new = (_by_node(settings) for settings in (before, after))
-    changed = [_changed(node, old.get(node, {}), new.get(node, {})) for node in {**old, **new}]
+def settings_change(before: Settings, after: Settings) -> tuple[list[SettingText], list[str]]:
+    """How `after`, made from one file only, differs from `before`.
+
+    Returns the limits of nodes that are new, as texts for the runner, and all other keys that have
+    changed.
+    """
+    old, new = (_limits(settings) for settings in (before, after))
+    both = {**old, **new}
+    changed = (place for place in both if old.get(place) != new.get(place))
+    limits = [new[place] if place in new else _usual(old[place]) for place in changed]
     own = {key for key in before.values if before.values[key] != after.values[key]}
     nodes = {
         f"nodes.{node}.{key}"
@@ -23,22 +30,18 @@ def settings_change(before: Settings, after: Settings) -> SettingsChange:
         for key, _ in _items(before, node) ^ _items(after, node)
         if key not in BY_KEY
     }
-    others = sorted(own - {NODE_LIMIT.name}) + sorted(nodes)
-    return SettingsChange(tuple(one for one in changed if one.limits), tuple(others))
+    return limits, sorted(own - {NODE_LIMIT.name}) + sorted(nodes)
 
 
-def _by_node(settings: Settings) -> dict[str, dict[str, int]]:
-    found: dict[str, dict[str, int]] = {}
-    for one in runner_texts(settings):
-        if one.node and (limit := BY_KEY.get(one.key)):
-            found.setdefault(one.node, {})[limit.word] = limit.parse(one.text)
-    return found
+def _limits(settings: Settings) -> dict[tuple[str, str], SettingText]:
+    given = (one for one in runner_texts(settings) if one.node and one.key in BY_KEY)
+    return {(one.node, one.key): one for one in given}
 
 
-def _changed(node: str, old: Mapping[str, int], new: Mapping[str, int]) -> NodeLimits:
-    """The new limits; a limit that is missing now is removed."""
-    gone = {word: _USUAL_WEIGHT if "weight" in word else INFINITY for word in old.keys() - new}
-    return node_limits(node, {**{w: v for w, v in new.items() if old.get(w) != v}, **gone})
+def _usual(gone: SettingText) -> SettingText:
+    """The text that removes a limit."""
+    usual = _USUAL_WEIGHT if "weight" in gone.key else INFINITY
+    return gone._replace(text=BY_KEY[gone.key].format(usual))
 
 
 def _items(settings: Settings, node: str) -> set[tuple[str, str]]:

@@ -16,7 +16,7 @@ from typing import Any
 from dora_systemd.adapters.dora.preparation import Prepared, resolved
 from dora_systemd.adapters.host.watch import Since, identity
 from dora_systemd.adapters.runner_socket.client import unknown_request
-from dora_systemd.decisions.cell.limits import check_nodes, limit_texts
+from dora_systemd.decisions.cell.limits import check_nodes, limits_of
 from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates, rate_texts
 from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, changed
 from dora_systemd.decisions.cell.rights import essential_nodes, rights_of
@@ -248,19 +248,20 @@ class Reloader:
 
     async def _take_settings(self, run: Run) -> list[str]:
         """Apply changed node limits at once; other settings wait for the next start."""
-        change = await asyncio.to_thread(self._settings.change)
-        check_nodes(change.limits, run.pump.cell.nodes, ())
-        run.nodes.limit(change.limits)
+        texts, others = await asyncio.to_thread(self._settings.change)
+        limits = limits_of(self.options._replace(settings=texts))
+        check_nodes(limits, run.pump.cell.nodes, ())
+        run.nodes.limit(limits)
         self._settings.accept()
-        self._change(limit_texts(change.limits))
+        self._change(texts)
         name = PurePath(self._settings.path).name
-        for one in change.limits:
+        for one in limits:
             run.pipes.write_event("node-reloaded", one.node, how="given new limits", reason=name)
-        if change.others:
-            keys = ", ".join(change.others)
+        if others:
+            keys = ", ".join(others)
             reason = f"{name}: {keys}: only doractl stop and start apply this"
             run.pipes.write_event("reload-failed", reason=reason)
-        return [f"the node {one.node} was given new limits: {name}" for one in change.limits]
+        return [f"the node {one.node} was given new limits: {name}" for one in limits]
 
     async def _apply(self, run: Run, change: Change) -> list[str]:
         applier = Applier(run, change, self.options, self._versions)

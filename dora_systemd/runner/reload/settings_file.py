@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from dora_systemd.adapters.host import files, process
-from dora_systemd.decisions.cell.limits import SettingsChange, format_node_limits, parse_node_limits
+from dora_systemd.decisions.cell.options import SettingText, format_setting, parse_setting
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight
@@ -50,8 +50,11 @@ class SettingsFile:
         else:
             self._copy.unlink(missing_ok=True)
 
-    def change(self) -> SettingsChange:
-        """Read the file, and compare it. Raises DoraSystemdError if it is not valid."""
+    def change(self) -> tuple[tuple[SettingText, ...], tuple[str, ...]]:
+        """Read the file; return new limits of nodes, and all other keys that have changed.
+
+        Raises DoraSystemdError if the file is not valid.
+        """
         self.take()
         versions = (str(self._copy), str(self._taken))
         command = [sys.executable, "-E", "-P", "-m", __name__, *versions, self.path]
@@ -59,8 +62,7 @@ class SettingsFile:
         if done.status:
             raise DoraSystemdError(done.stderr.strip(), "", ExitCode.BAD_INPUT)
         found = json.loads(done.stdout)
-        limits = tuple(map(parse_node_limits, found["limits"]))
-        return SettingsChange(limits, tuple(found["others"]))
+        return tuple(map(parse_setting, found["limits"])), tuple(found["others"])
 
 
 def main(before: str, after: str, name: str) -> int:
@@ -77,9 +79,8 @@ def main(before: str, after: str, name: str) -> int:
     except DoraSystemdError as error:
         print(error.message, file=sys.stderr)
         return error.code
-    change = settings_change(*both)
-    limits = [format_node_limits(one) for one in change.limits]
-    print(json.dumps({"limits": limits, "others": change.others}))
+    limits, others = settings_change(*both)
+    print(json.dumps({"limits": [*map(format_setting, limits)], "others": others}))
     return 0
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Beside, Observer, Property, UnitState
-from dora_systemd.decisions.cell.limits import NodeLimits, limit_texts
+from dora_systemd.decisions.cell.limits import BY_WORD, NodeLimits
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     SettingText,
@@ -57,7 +57,8 @@ def with_texts(options: RunnerOptions, *texts: str) -> RunnerOptions:
 
 
 def with_limits(options: RunnerOptions, *limits: NodeLimits) -> RunnerOptions:
-    return _with(options, limit_texts(limits))
+    given = ((one.node, BY_WORD[word], value) for one in limits for word, value in one.limits)
+    return _with(options, (SettingText(n, one.key, one.format(value)) for n, one, value in given))
 
 
 def with_rights(options: RunnerOptions, *rights: NodeRights) -> RunnerOptions:

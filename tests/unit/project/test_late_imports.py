@@ -78,7 +78,7 @@ LATE = {
         "cli.verbs.look.logs": {"verbs.follow", "cli.remote.machines"},
     },
     "limits, CPUs or rights of single nodes only": {
-        "decisions.cell.limits": {"node_words", "decisions.cell.options"},
+        "decisions.cell.limits": {"node_words"},
     },
     "uv only": {"decisions.cell.uv": {"tomllib"}},
     "JSON is for programs, and most who do something are people": {

@@ -1,6 +1,6 @@
 """What of a changed settings file can be taken over at once."""
 
-from dora_systemd.decisions.cell.limits import format_node_limits
+from dora_systemd.decisions.cell.options import format_setting
 from dora_systemd.decisions.settings.differences import settings_change
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 
@@ -10,8 +10,8 @@ def of(document: object) -> Settings:
 
 
 def change(before: object, after: object) -> tuple[list[str], list[str]]:
-    found = settings_change(of(before), of(after))
-    return [format_node_limits(one) for one in found.limits], list(found.others)
+    texts, others = settings_change(of(before), of(after))
+    return [format_setting(one) for one in texts], others
 
 
 def test_nothing() -> None:
@@ -24,7 +24,10 @@ def test_limits_of_nodes() -> None:
     before = {"nodes": {"a": {"memory_limit": "1G", "cpu_weight": 50}, "b": {"cpu_limit": 1}}}
     after = {"nodes": {"a": {"memory_limit": "2G"}}, "node_limit": ["c:tasks=9"]}
     limits, others = change(before, after)
-    assert limits == ["a:memory=2G,cpu-weight=100", "b:cpu=infinity", "c:tasks=9"]
+    assert limits == [
+        *("a:memory_limit=2G", "a:cpu_weight=100"),
+        *("b:cpu_limit=infinity", "c:tasks_limit=9"),
+    ]
     assert others == []
 
 

@@ -11,9 +11,8 @@ from typing import Any, cast
 import pytest
 
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
-from dora_systemd.decisions.cell.limits import SettingsChange
 from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates, rates_of
-from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State
@@ -118,10 +117,10 @@ def test_each_version_of_the_settings_is_read_once(tmp_path: Path) -> None:
     class Saved(SettingsFile):
         """Saved again just after it was read."""
 
-        def change(self) -> SettingsChange:
+        def change(self) -> tuple[tuple[SettingText, ...], tuple[str, ...]]:
             self.take()
             Path(self.path).write_text("memory_limit: 3G\n")
-            return SettingsChange((), ())
+            return (), ()
 
     async def work() -> None:
         bench = Bench(tmp_path, Saved)
@@ -178,7 +177,7 @@ def test_versions_of_a_settings_file(tmp_path: Path, capfd: pytest.CaptureFixtur
     before.write_text("nodes: {a: {memory_limit: 1G}}\n")
     after.write_text("nodes: {a: {memory_limit: 2G}}\nnice: 5\n")
     assert main(str(before), str(after), "/srv/flow.systemd.yml") == 0
-    assert capfd.readouterr().out == '{"limits": ["a:memory=2G"], "others": ["nice"]}\n'
+    assert capfd.readouterr().out == '{"limits": ["a:memory_limit=2G"], "others": ["nice"]}\n'
     after.write_text("nodes: [")
     assert main(str(before), str(after), "/srv/flow.systemd.yml") != 0
     assert "cannot read /srv/flow.systemd.yml: line" in capfd.readouterr().err
