@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.cell.environment import SET_VARIABLE, with_changes
+from dora_systemd.decisions.cell.launch import watchdogs_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import (
     MODULES,
@@ -16,7 +17,7 @@ from dora_systemd.decisions.cell.options import (
     parse_setting,
     runner_setting,
 )
-from dora_systemd.decisions.cell.owes import owes_of
+from dora_systemd.decisions.cell.owes import owes_of, policies_of
 from dora_systemd.decisions.cell.rights import NodeRights, rights_of
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.descriptor.nodes import parse_node
@@ -27,8 +28,9 @@ from dora_systemd.decisions.remote.hosts import parse_host
 from dora_systemd.decisions.settings.resolve import resolve_settings, with_settings
 from dora_systemd.decisions.settings.runner import check_settings
 from dora_systemd.decisions.settings.table import SETTINGS
+from dora_systemd.decisions.watchdog.watchdogs import ALL_NODES, OFF
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora")
@@ -143,6 +145,17 @@ def test_the_head_decides_with_what_its_members_know_too() -> None:
     assert head.by_node("essential") == {"camera": True, "yolo": True}
     assert words == ["essential=yes", "yolo:essential=yes"]
     assert there.by_node("essential") == {"yolo": True}
+
+
+def test_who_restarts_nodes_and_who_watches_them() -> None:
+    """dora on the head restarts them; each machine has the sockets of its own nodes."""
+    head, words, there = spread("restart_policy", "always")
+    assert (words, there.by_node("restart_policy")) == ([], {})
+    assert policies_of(head).keys() == {"camera", "yolo"}
+    head, words, there = spread("notify", "yes")
+    assert words == ["notify=yes", "yolo:notify=yes"]
+    assert watchdogs_of(head) == {ALL_NODES: INFINITY, "yolo": OFF}
+    assert watchdogs_of(there) == {ALL_NODES: INFINITY}
 
 
 def test_members_watch_no_outputs() -> None:
