@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Sequence, Set
 from copy import copy
+from pathlib import Path
 from typing import Any
 
 import click
@@ -14,6 +15,7 @@ from dora_systemd.cli.remote.run import is_terminal, pass_through, run_on_all, r
 from dora_systemd.decisions.remote.command_line import part_hosts
 from dora_systemd.decisions.remote.hosts import ALL, Host, given_words
 from dora_systemd.errors import ExitCode
+from dora_systemd.trust.paths import exists
 from dora_systemd.verbs.remote.hosts import find_hosts
 
 
@@ -73,10 +75,10 @@ def _run(context: click.Context, words: list[str], command_line: list[str]) -> i
     hosts = find_hosts(words, os.environ)
     check_hosts(plan, len(hosts))
     status = _run_on(hosts, plan, is_several=len(hosts) > 1 or ALL in words)
-    if status == ExitCode.BAD_INPUT and plan.has_relative_file and not plan.wants_json:
+    if status == ExitCode.BAD_INPUT and not plan.wants_json:
         where = "that host" if len(hosts) > 1 else hosts[0].text
-        hint = f"FILE is a path on {where}, and begins in the home directory there"
-        print(f"hint: {hint}", file=sys.stderr)
+        if hint := plan.file_hint(where, exists(Path(plan.file).absolute())):
+            print(f"hint: {hint}", file=sys.stderr)
     return status
 
 

@@ -53,10 +53,18 @@ class Plan(NamedTuple):
         return self.acts or self.is_endless
 
     @property
-    def has_relative_file(self) -> bool:
-        """Whether it starts a FILE that is not an absolute path; only the host knows its files."""
-        file = str(self.options.get("dataflow") or "/") if self.verb != "deploy" else "/"
-        return not file.startswith("/") and ("/" in file or file.endswith(_FILES))
+    def file(self) -> str:
+        """The FILE that it reads there, or "": only the host knows its files."""
+        file = str(self.options.get("dataflow") or "") if self.verb != "deploy" else ""
+        return file if "/" in file or file.endswith(_FILES) else ""
+
+    def file_hint(self, where: str, is_here: bool) -> str:
+        """The hint about a FILE that the verb refused, or "". is_here: the FILE exists here."""
+        if not self.file or not (is_here or self.file[0] != "/"):
+            return ""
+        start = "" if self.file[0] == "/" else ", and begins in the home directory there"
+        here = "; the one here is not read, doractl deploy copies it" if is_here else ""
+        return f"FILE is a path on {where}{start}{here}"
 
     @property
     def most_seconds(self) -> float | None:

@@ -43,7 +43,7 @@ from dora_systemd.decisions.views.findings import (
     judge_real_time,
     storage_of,
 )
-from dora_systemd.decisions.views.upkeep import judge_core_pattern, judge_reboots
+from dora_systemd.decisions.views.upkeep import judge_core_pattern, judge_reboots, judge_stops
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of
@@ -69,6 +69,7 @@ JOURNALD = "systemd-journald.service"
 
 _SECONDS = 20.0
 _STARTED = "ExecMainStartTimestamp"
+_STOP = ("TimeoutStopUSec",)
 _JOURNALD_CONFIG = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
 _COREDUMP_CONFIG = ("systemd-analyze", "--no-pager", "cat-config", "systemd/coredump.conf")
 _PRESSURE = "proc/pressure"
@@ -89,7 +90,7 @@ def examine(
     else:
         found = [judge_systemd(version)]
         found += [one for check in _WITH_SYSTEMD for one in guarded(check, manager, scope, root)]
-    found += _journal(reach, scope)
+    found += [*_journal(reach, scope), *_stops(reach, scope)]
     return found + [one for check in _WITHOUT for one in check(scope, root)]
 
 
@@ -240,6 +241,19 @@ def _journal_place(reach: Callable[[Scope], Manager]) -> Place:
     if facts["ActiveState"] in DOWN:
         return Place.STOPPED
     return journal_reader.place_since(int(facts[_STARTED]))
+
+
+def _stops(reach: Callable[[Scope], Manager], scope: Scope) -> Iterator[Finding]:
+    """Compare the stops of a user's dataflows with what systemd allows all services of a user."""
+    if not scope.is_user:
+        return
+    with suppress(DoraSystemdError):
+        manager = reach(scope)
+        units = [(cell.name, cell.unit) for cell in proven(read_cells(manager))]
+        stops = {name: manager.read(unit, _STOP)[_STOP[0]] for name, unit in units}
+        of_user = f"user@{scope.uid}.service"
+        allowed = reach(scope_of(is_user=False)).read(of_user, _STOP)[_STOP[0]]
+        yield from judge_stops(stops, allowed)
 
 
 def _dora(_scope: Scope, _root: Path) -> Iterator[Finding]:

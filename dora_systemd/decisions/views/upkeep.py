@@ -1,10 +1,11 @@
-"""What else happens to a machine: core dumps, and upgrades that reboot it. Pure."""
+"""What else happens to a machine: core dumps, upgrades that reboot it, its shutdown. Pure."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from dora_systemd.decisions.cell.core_dumps import keeps_core_dumps
 from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.values import format_duration
 
 _APPORT = re.compile(r"\|\S*/apport(?:\s|$)")
 _ASSIGNMENT = re.compile(r"^[ \t]*(\w+)[ \t]*=(.*)$", re.M)
@@ -68,6 +69,20 @@ def judge_reboots(config: str) -> Iterator[Finding]:
     text = f"unattended upgrades may reboot this machine {at}, whatever runs"
     remedy = 'as root: set Unattended-Upgrade::Automatic-Reboot "false"; in the last file of '
     yield Finding("upgrades", State.WARNING, text, f"{remedy}/etc/apt/apt.conf.d")
+
+
+def judge_stops(stops: Mapping[str, int], allowed: int) -> Iterator[Finding]:
+    """Warn of dataflows of a user that a shutdown would kill while they stop.
+
+    stops: how long the stop of each may take, by name. allowed: how long systemd waits for all
+    services of the user. Both in µs.
+    """
+    for name, needed in sorted(stops.items()):
+        if allowed and needed > allowed:
+            times = f"{format_duration(needed)}, and a shutdown waits {format_duration(allowed)}"
+            text = f"the stop of {name} may take {times} for all services of a user"
+            remedy = "as root: systemctl edit user@.service, [Service] TimeoutStopSec="
+            yield Finding("stop", State.WARNING, text, remedy + format_duration(needed))
 
 
 def _unfolded(block: re.Match[str]) -> str:

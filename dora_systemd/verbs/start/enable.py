@@ -63,6 +63,11 @@ class BootUnit:
         return self.is_wanted and self.text is not None
 
     @property
+    def can_start(self) -> bool:
+        """Whether it is enabled, by a unit file whose options this version knows."""
+        return self.is_enabled and runner_of(self.text or "", can_start=True) is not None
+
+    @property
     def is_checked(self) -> bool:
         """Whether a boot is good only if the dataflow comes up."""
         return self.is_enabled and is_boot_checked(self.text or "")
@@ -96,11 +101,12 @@ def enable_cell(
     """
     refuse_attached(cell)
     refuse_member(cell.options)
+    _refuse_other_version(cell)
     if is_checked and scope.is_user:
         message = "cannot check the boot with a dataflow of a user"
         raise DoraSystemdError(message, "use --system", ExitCode.USAGE)
     boot = read_boot_unit(manager, scope, cell.unit)
-    if boot.is_enabled and (boot.is_checked or not is_checked):
+    if boot.can_start and (boot.is_checked or not is_checked):
         return boot, False
     facts = manager.read(cell.unit, ["FragmentPath", "DropInPaths", "Transient"])
     texts = _present_texts(boot, facts, is_checked)
@@ -125,7 +131,7 @@ def _present_texts(boot: BootUnit, facts: Mapping[str, Any], is_checked: bool) -
     foreign file that would have to be changed.
     """
     fragment = Path(facts["FragmentPath"])
-    if not boot.is_enabled and (facts["Transient"] or fragment == boot.runtime):
+    if not boot.can_start and (facts["Transient"] or fragment == boot.runtime):
         # Changes by doractl set are in drop-ins that a reboot removes: include them.
         drop_ins = [one for one in map(Path, facts["DropInPaths"]) if one.is_relative_to("/run")]
         return [read_unit_file(path) or "" for path in (fragment, *drop_ins)]
@@ -147,6 +153,14 @@ def refuse_member(options: RunnerOptions) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a part of a dataflow: its head starts it."""
     if options.machine:
         raise no_unit_file(options.name, "its head is another machine", "use doractl enable there")
+
+
+def _refuse_other_version(cell: Cell) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a dataflow whose unit this version cannot start."""
+    if cell.options_problem:
+        why = "another version of dora-systemd has started it"
+        hint = f"doractl list {cell.name} says how to start this version"
+        raise no_unit_file(cell.name, why, hint)
 
 
 def _loaded_links(manager: Manager, scope: Scope, options: RunnerOptions) -> dict[str, str]:

@@ -197,11 +197,21 @@ def test_without_ssh(capsys: Printed, monkeypatch: pytest.MonkeyPatch, tmp_path:
         assert "doractl: cannot execute ssh: No such file" in capsys.readouterr().err
 
 
-def test_a_relative_file(capsys: Printed) -> None:
+def test_a_file_that_the_host_refuses(
+    capsys: Printed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     make_program(Path(os.environ["PATH"].partition(":")[0]) / "doractl", "exit 5")
-    for words, is_told in ((["x.yml"], True), (["/x.yml"], False), (["robot"], False)):
-        assert main.run(["start", *words, "-H", "h1"]) == ExitCode.BAD_INPUT
-        assert ("hint: FILE is a path on h1" in capsys.readouterr().err) == is_told
+    monkeypatch.chdir(tmp_path)
+    here = tmp_path / "here.yml"
+    here.touch()
+    begins, copies = "begins in the home directory there", "doractl deploy copies it"
+    hints = {"x.yml": [begins], "here.yml": [begins, copies], str(here): [copies]}
+    for words, expected in {**hints, "/x.yml": [], "robot": []}.items():
+        for verb in ("start", "build"):
+            assert main.run([verb, words, "-H", "h1"]) == ExitCode.BAD_INPUT
+            said = capsys.readouterr().err
+            assert ("hint: FILE is a path on h1" in said) == bool(expected)
+            assert [one for one in (begins, copies) if one in said] == expected
 
 
 def test_no_verb_takes_a_host_itself() -> None:

@@ -76,6 +76,15 @@ def test_its_own_gateway_is_no_stranger(manager: FakeManager, scope: Scope, tmp_
     assert "port 6013" in found(manager, scope)
 
 
+def test_a_stop_that_is_longer_than_that_of_its_user(manager: FakeManager, tmp_path: Path) -> None:
+    user = ScopeIn(is_user=True, uid=1000, root=tmp_path / "run")
+    manager.add(options(), TimeoutStopUSec=300_000_000)
+    manager.units["user@1000.service"] = {"TimeoutStopUSec": 120_000_000}
+    assert "the stop of robot may take 5min" in found(manager, user)["stop"].text
+    manager.units["user@1000.service"] = {"TimeoutStopUSec": 300_000_000}
+    assert "stop" not in found(manager, user)
+
+
 def test_without_systemd(manager: FakeManager, scope: Scope) -> None:
     def reach(_scope: Scope) -> FakeManager:
         raise DoraSystemdError("cannot reach systemd", "boot with it", ExitCode.NO_SYSTEMD)

@@ -3,7 +3,7 @@
 import pytest
 
 from dora_systemd.decisions.views.findings import State
-from dora_systemd.decisions.views.upkeep import judge_core_pattern, judge_reboots
+from dora_systemd.decisions.views.upkeep import judge_core_pattern, judge_reboots, judge_stops
 
 SYSTEMD = "|/usr/lib/systemd/systemd-coredump %P %u %g %s %t 9223372036854775808 %h %d\n"
 PATTERNS = {
@@ -72,3 +72,13 @@ def test_upgrades_that_reboot(config: str, expected: str) -> None:
     for one in findings:
         assert one.state is State.WARNING
         assert expected in one.text
+
+
+def test_stops_longer_than_a_shutdown_waits_for_a_user() -> None:
+    minute = 60_000_000
+    (finding,) = judge_stops({"robot": 5 * minute, "vision": 2 * minute}, 2 * minute)
+    assert finding.text == (
+        "the stop of robot may take 5min, and a shutdown waits 2min for all services of a user"
+    )
+    assert finding.remedy.endswith("[Service] TimeoutStopSec=5min")
+    assert not list(judge_stops({"robot": 5 * minute}, 0))

@@ -87,6 +87,28 @@ def test_enabled_twice(manager: FakeManager, scope: Scope) -> None:
     assert path_of(manager).stat().st_ino == before.st_ino
 
 
+def test_a_file_of_another_version_is_written_anew(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    enable_cell(manager, scope, cell)
+    text = path_of(manager).read_text()
+    path_of(manager).write_text(text.replace("--name=robot", "--name=robot --future=1"))
+    assert enable_cell(manager, scope, cell)[1] is True
+    assert path_of(manager).read_text() == text
+
+
+def test_what_another_version_has_started_cannot_be_enabled(
+    manager: FakeManager, scope: Scope
+) -> None:
+    """The unit file would start a command line that this version refuses, at the next boot."""
+    started(manager)
+    ((program, argv, *rest),) = manager.units[UNIT]["ExecStart"]
+    manager.units[UNIT]["ExecStart"] = [[program, [*argv[:-1], "--future=1", argv[-1]], *rest]]
+    with pytest.raises(DoraSystemdError, match="another version of dora-systemd") as error:
+        enable_cell(manager, scope, Selector("robot").find(manager))
+    assert error.value.hint == "doractl list robot says how to start this version"
+    assert not path_of(manager).exists()
+
+
 def test_a_foreign_file_is_not_touched(manager: FakeManager, scope: Scope) -> None:
     cell = started(manager)
     path_of(manager).parent.mkdir(parents=True)
