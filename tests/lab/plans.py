@@ -215,7 +215,7 @@ def plan_openarm(_form: str) -> list[Step]:
 
 def openarm_step() -> Step:
     arguments = ["tests/system", "-m", "openarm"]
-    return lab_step("nodes of OpenArm from PyPI", "openarm", arguments, minutes=1)
+    return lab_step("nodes of OpenArm from PyPI", "openarm", arguments, minutes=2)
 
 
 def plan_machines(_form: str) -> list[Step]:

@@ -263,11 +263,16 @@ def _hint(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
     """Return the hint for a missing program."""
     if node.build:
         return _build_hint(source, plan)
+    correct, first = "correct the path of the node", ""
     places = dict.fromkeys((directory, plan.options.working_directory))
-    locked = find_lock(places, plan.exists)
-    if locked and "/" not in node.path:  # a console script of a package
-        return f"{_build_hint(source, plan)}, or correct the path of the node"
-    return "correct the path of the node"
+    if "/" in node.path:
+        return correct
+    # It may be a console script of a package.
+    if find_lock(places, plan.exists):
+        first = _build_hint(source, plan)
+    elif projects := [one for one in places if plan.exists(f"{one}/pyproject.toml")]:
+        first = f"run `uv sync` in {shown(projects[0])} first"
+    return f"{first}, or {correct}" if first else correct
 
 
 def _build_hint(source: str, plan: LaunchPlan) -> str:

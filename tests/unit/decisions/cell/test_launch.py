@@ -217,6 +217,7 @@ def test_refusals(node: dict[str, Any], words: str) -> None:
 HINTS: tuple[tuple[dict[str, Any], tuple[str, ...], str], ...] = (
     ({"path": "robot-camera"}, (), "correct the path of the node"),
     ({"path": "robot-camera"}, ("/p/uv.lock",), "run `doractl build flow.yml` first, or"),
+    ({"path": "robot-camera"}, ("/p/pyproject.toml",), "run `uv sync` in /p first, or correct"),
     ({"path": "src/nope.py"}, ("/p/uv.lock",), "correct the path of the node"),
     (
         {"path": "robot-camera", "build": "make"},
