@@ -27,7 +27,7 @@ from dora_systemd.names import is_name, is_uuid_prefix
 
 VARIABLE = "_DORACTL_COMPLETE"
 
-_OF_THE_PAST = ("list", "logs", "restart", "start", "why")
+_OF_THE_PAST = ("bundle", "list", "logs", "restart", "start", "why")
 """Verbs that also accept dataflows that only the journal knows."""
 
 _RUNNING_ONLY = ("stop", "dora", "env", "top")
@@ -123,6 +123,16 @@ def release_ids(ctx: click.Context, _incomplete: str) -> list[str]:
     return [one.id for one in store_of(current_scope(), name).known()]
 
 
+def bundle_names(ctx: click.Context, _incomplete: str) -> list[str]:
+    """The bundles of the dataflow that is on the command line."""
+    from dora_systemd.verbs.bundles.listing import store_of
+
+    name = ctx.params.get("selector") or next(iter(ctx.args), "")
+    if is_elsewhere() or not is_name(name):
+        return []
+    return [one.id for one in store_of(current_scope(), name).known()]
+
+
 # By name of the parameter, for all verbs.
 TYPES: dict[str, Any] = {
     "selector": Live(dataflow_names),
@@ -139,6 +149,8 @@ TYPES: dict[str, Any] = {
     "dora": click.File(),
     "env_file": click.File(),
     "device": click.File(),
+    "file": click.File(),
+    "bundle": Live(bundle_names),
     "user": Live(user_names),
     "host": Live(host_names),
     "restart_policy": click.Choice(POLICIES),

@@ -5,15 +5,18 @@ A new reader is one new line in TARGETS, and a file with a good example in corpu
 """
 
 import json
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dora_systemd.adapters.bundles.reader import opened
 from dora_systemd.adapters.dora.command import parse_dora_version, version_numbers
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.adapters.runner_socket.client import parse_line
+from dora_systemd.decisions.bundles.manifest import parse_manifest
 from dora_systemd.decisions.cell.environment import SET_VARIABLE, changes_of
 from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.exits import parse_exit
@@ -230,6 +233,19 @@ def _parcel(data: bytes) -> None:
         assert not path.startswith("/")
 
 
+def _bundle(data: bytes) -> None:
+    """What is accepted as a whole can be read in parts."""
+    fd = os.memfd_create("bundle")
+    try:
+        os.write(fd, data)
+        with opened(Path(f"/proc/self/fd/{fd}")) as found:
+            found.check()
+            for part in found.manifest.parts:
+                assert len(found.read(part.name)) == part.size
+    finally:
+        os.close(fd)
+
+
 REFUSED = (DoraSystemdError,)
 
 TARGETS = {
@@ -269,6 +285,8 @@ TARGETS = {
     "parcel": Target(_parcel, REFUSED),
     "ring": Target(_ring, (ValueError,)),
     "link": Target(_link),
+    "bundle": Target(_bundle, REFUSED),
+    "manifest": Target(lambda data: parse_manifest(data, "x.tar"), REFUSED),
     "dora-version": Target(
         lambda data: version_numbers(parse_dora_version(text_of(data)) or text_of(data))
     ),

@@ -1,5 +1,8 @@
 """Explain what happened to a dataflow and why."""
 
+import json
+from pathlib import Path
+
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
@@ -7,15 +10,16 @@ from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.why.report import format_report, report_object
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.why import explain_now, newest_failure, subject_row
 
 
 @click.command("why")
 @click.argument("selector", required=False)
+@click.option("--bundle", "file", metavar="FILE", help="Print the report in a bundle.")
 @output_option
 @scope_options
-def command(selector: str | None, output: str) -> int:
+def command(selector: str | None, file: str | None, output: str) -> int:
     """Explain what happened to a dataflow and why: what ended, when, which node, what to do.
 
     The dataflow may be running, failed, stopped, or known only to the journal. Nothing is changed.
@@ -27,7 +31,10 @@ def command(selector: str | None, output: str) -> int:
       doractl why robot             what ended it, which node, when, what to do
       doractl why robot -o json     the same for a program
       doractl why 44f30e60          one that ended long ago, by its UUID
+      doractl why --bundle FILE     the report in a bundle, on any machine
     """
+    if file is not None:
+        return _print_bundle(selector, Path(file).absolute(), output)
     scope = current_scope()
     check_readable(scope)
     bus = Bus(scope, for_reading=True)
@@ -36,4 +43,20 @@ def command(selector: str | None, output: str) -> int:
         print_json(report_object(report, subject_row(bus, scope, report.subject)))
         return ExitCode.OK
     print_table(lambda width, colors: format_report(report, width, colors))
+    return ExitCode.OK
+
+
+def _print_bundle(selector: str | None, path: Path, output: str) -> int:
+    """Print the report in a bundle, which may be of another machine, or forged."""
+    # Imported late: most explain what this machine knows.
+    from dora_systemd.verbs.bundles.listing import parse_why, read_report, shown_readme
+
+    if selector is not None:
+        hint = "doractl why --bundle FILE"
+        raise DoraSystemdError("cannot use both a SELECTOR and --bundle", hint, ExitCode.USAGE)
+    readme, why = read_report(path)
+    if output == "json":
+        click.echo(json.dumps(parse_why(why, path), indent=2))
+    else:
+        print_table(lambda width, _: shown_readme(readme, width))
     return ExitCode.OK

@@ -153,6 +153,11 @@ EVENTS = {
         WARNING,
         "Notice about dataflow {dataflow} is not sent",
     ),
+    "bundle-written": EventKind(
+        "bc2beafec775423d869cf2b811d8d1ab",
+        NOTICE,
+        "Bundle of dataflow {dataflow} is written: {file}",
+    ),
     "build-failed": EventKind(
         "c598b7b44f614a64a048fc856c696082",
         WARNING,
@@ -169,6 +174,7 @@ ROLLED_BACK = "release-rolled-back"
 BUILD_FAILED = "build-failed"
 FORGOTTEN = "dataflow-forgotten"
 GIVEN_UP, NOTICE_SENT, NOTICE_FAILED = "node-given-up", "notice-sent", "notice-failed"
+BUNDLE_WRITTEN = "bundle-written"
 REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK, BUILD_FAILED)
 """What doractl writes about a dataflow, outside of its unit."""
 

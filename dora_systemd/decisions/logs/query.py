@@ -176,6 +176,17 @@ def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
     return [*own, "+", *_systemd_matches(scope, name), "+", *asked]
 
 
+def bundle_matches(scope: Scope, name: str, uuid: str) -> list[str]:
+    """Matches for all records of a dataflow, systemd's of its unit, and requests."""
+    asked = [f"DORA_DATAFLOW={uuid}", *_asked_matches(scope, *REQUESTS)]
+    return [*scope_matches(scope, name), "+", *_systemd_matches(scope, name), "+", *asked]
+
+
+def kernel_matches() -> list[str]:
+    """Matches for the records of the kernel: journald itself sets _TRANSPORT."""
+    return ["_TRANSPORT=kernel"]
+
+
 def notice_matches(scope: Scope, name: str) -> list[str]:
     """Matches for all that a notice reports, and for the notices that were sent."""
     events = [f"DORA_EVENT={one}" for one in ("dataflow-failed", "machine-lost", GIVEN_UP)]

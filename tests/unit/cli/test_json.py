@@ -19,7 +19,7 @@ from tests.unit.fakes.manager import UUID, FakeManager, options
 
 OTHER = UUID[:-1] + "1"
 UNIT = "dora-robot.service"
-NOT_FOR_PROGRAMS = {"run", "dora", "env", "export", "logs", "member"}
+NOT_FOR_PROGRAMS = {"bundle", "run", "dora", "env", "export", "logs", "member"}
 """They print what a node, dora or a shell prints or reads; logs has the journal's JSON."""
 
 

@@ -15,6 +15,9 @@ LATE = {
         "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
         "gateway.live.actions": {"verbs.releases.listing", "verbs.releases.rollback"},
     },
+    "a report of what this machine knows reads no bundle": {
+        "cli.verbs.look.why": {"verbs.bundles.listing"},
+    },
     "only some verbs wrap, and only on a terminal": {
         "terminal_text": {"textwrap"},
     },
@@ -48,7 +51,7 @@ LATE = {
     "a Tab after a verb or an option does not ask for a dataflow": {
         "cli.completion": {
             *("verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"),
-            *("verbs.releases.listing", "verbs.remote.hosts"),
+            *("verbs.releases.listing", "verbs.remote.hosts", "verbs.bundles.listing"),
         },
     },
     "seldom: what is not in systemd, has restarted, was killed, or enabled while it ran": {

@@ -49,6 +49,7 @@ _TABLE = {
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh cli.main
+        adapters.bundles.reader
         cli.edge cli.verbs.look.logs decisions.cell.launch verbs.inhibit
         verbs.machines.member verbs.machines.push verbs.start.limits verbs.start.startable
         verbs.start.where
@@ -62,6 +63,7 @@ _TABLE = {
     ROOTS: """
         adapters.bus.connection adapters.host.unit_files
         adapters.host.guard
+        adapters.bundles.archive adapters.bundles.store verbs.bundles.listing
         adapters.releases.draft adapters.releases.transfer
         adapters.releases.store verbs.releases.source verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor

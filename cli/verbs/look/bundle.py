@@ -1,0 +1,39 @@
+"""Write the evidence of a failure to one file."""
+
+from functools import partial
+from pathlib import Path
+
+import click
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.journal.reader import check_readable
+from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.errors import ExitCode
+from dora_systemd.verbs.bundles.write import write_bundle
+
+
+@click.command("bundle")
+@click.argument("selector")
+@click.option("-o", "--output", "file", metavar="FILE", help="Write it there.")
+@click.option("--no-journal", is_flag=True, help="Leave out everything that nodes have written.")
+@scope_options
+def command(selector: str, file: str | None, no_journal: bool) -> int:
+    """Write a tar file about a dataflow: what `why` says, its journal, unit, nodes and limits.
+
+    It never has values of variables, arguments, settings or credentials. What nodes have written
+    to their logs is in it as it is, unless --no-journal is given. Without -o it is kept with the
+    bundles that `doractl bundles` lists. Only its owner can read it.
+
+    Examples:
+      doractl bundle robot
+      doractl bundle robot -o robot.tar --no-journal
+      doractl why --bundle robot.tar
+    """
+    scope = current_scope()
+    check_readable(scope)
+    place = Path(file).absolute() if file else None
+    reach = partial(Bus, for_reading=True)
+    done = write_bundle(reach, scope, selector, "doractl bundle", place, not no_journal)
+    print_warnings(f"not in the bundle: {one}" for one in done.errors)
+    click.echo(str(done.path))
+    return ExitCode.OK

@@ -1,0 +1,163 @@
+"""`doractl bundle`: writes a bundle to a file, or to the store of the dataflow."""
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from dora_systemd import __version__
+from dora_systemd.adapters.bundles.archive import Archive, Section, Sink
+from dora_systemd.adapters.bundles.store import LEAST, REQUESTED, BundleStore, locked, room
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.note import note_request, requester
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.bundles.allowlist import kept_report
+from dora_systemd.decisions.bundles.manifest import (
+    ERRORS,
+    MANIFEST,
+    README,
+    Manifest,
+    format_manifest,
+)
+from dora_systemd.decisions.bundles.readme import format_readme
+from dora_systemd.decisions.logs.journal_events import BUNDLE_WRITTEN
+from dora_systemd.decisions.why.report import format_report
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.values import shown
+from dora_systemd.verbs.bundles.collect import Evidence, sections_of
+from dora_systemd.verbs.doctor import examine
+from dora_systemd.verbs.facts.cells import read_cell
+from dora_systemd.verbs.why import explain, subject_row
+
+MOST_BYTES = 256 * 1024 * 1024
+"""Maximum bytes of a bundle that is requested."""
+_STAMP = "%Y%m%dT%H%M%SZ"
+
+
+class Written(NamedTuple):
+    """A bundle that was written."""
+
+    path: Path
+    manifest: Manifest
+    errors: tuple[str, ...]  # sections that could not be written
+
+    @property
+    def name(self) -> str:
+        """The name of the dataflow."""
+        return self.manifest.name
+
+    @property
+    def uuid(self) -> str:
+        """The UUID of the dataflow."""
+        return self.manifest.uuid
+
+    @property
+    def unit(self) -> str:
+        """The unit of the dataflow."""
+        return self.manifest.unit
+
+
+def write_bundle(
+    reach: Callable[[Scope], Manager],
+    scope: Scope,
+    selector: str,
+    command: str,
+    file: Path | None = None,
+    want_journal: bool = True,
+) -> Written:
+    """Write a bundle of the dataflow to `file`, by default to its store. Raises DoraSystemdError.
+
+    reach: opens the connection to systemd. command: that requests it, such as "doractl bundle".
+    """
+    manager, journal = reach(scope), JournalReader()
+    report = explain(manager, scope, selector, journal)
+    subject = report.subject
+    cell = read_cell(manager, subject.unit) if subject.is_loaded else None
+    row = subject_row(manager, scope, subject)
+    what = Evidence(manager, scope, report, row, cell, want_journal, partial(examine, reach, scope))
+    manifest = _manifest(what, requester(command))
+    if file is not None:
+        with _explained(file):
+            written = _write(file, min(MOST_BYTES, room(file.parent)), what, manifest)
+    else:
+        store = BundleStore(scope.state_root, subject.name)
+        with locked(store), _explained(store.path):
+            store.remove_partial()
+            path = store.new_path(time.strftime(_STAMP, time.gmtime()), REQUESTED)
+            written = _write(path, min(MOST_BYTES, room(store.path)), what, manifest)
+    details = {"scope": scope.word, "file": str(written.path)}
+    note_request(BUNDLE_WRITTEN, subject.name, subject.uuid, command, **details)
+    return written
+
+
+def _manifest(what: Evidence, by: str) -> Manifest:
+    subject, verdict = what.report.subject, what.report.verdict
+    return Manifest(
+        name=subject.name,
+        uuid=subject.uuid,
+        unit=subject.unit,
+        scope=what.scope.word,
+        host=os.uname().nodename,
+        at_us=time.time_ns() // 1000,
+        by=by,
+        node=verdict.node,
+        cause=str(verdict.cause),
+        summary=verdict.summary,
+        versions={
+            "doractl": __version__,
+            "python": platform.python_version(),
+            "systemd": what.manager.version(),
+            "kernel": os.uname().release,
+            "machine": os.uname().machine,
+        },
+    )
+
+
+def _write(path: Path, most: int, what: Evidence, manifest: Manifest) -> Written:
+    """Write all sections, then the errors and the manifest. Raises OSError."""
+    sections = sections_of(what)
+    with Archive(path, max(most, LEAST), manifest.at_us) as archive:
+        archive.add(Section(README, _readme(what, manifest, sections)))
+        for one in sections:
+            archive.add(one)
+        errors = tuple(archive.errors)
+        archive.add(Section(ERRORS, _text("".join(f"{one}\n" for one in errors))), reserve=0)
+        left_out = (*what.left_out, *(f"{one}: see {ERRORS}" for one in _failed(errors)))
+        manifest = replace(manifest, left_out=left_out, parts=tuple(archive.parts))
+        archive.add(Section(MANIFEST, _text(format_manifest(manifest))), reserve=0)
+    return Written(path, manifest, errors)
+
+
+def _failed(errors: tuple[str, ...]) -> Iterator[str]:
+    yield from (one.partition(":")[0] for one in errors)
+
+
+def _readme(
+    what: Evidence, manifest: Manifest, sections: list[Section]
+) -> Callable[[Sink], object]:
+    why = format_report(kept_report(what.report, what.want_journal))
+    names = [*(one.name for one in sections), ERRORS, MANIFEST]
+    return _text(format_readme(manifest, why, names, what.want_journal))
+
+
+def _text(text: str) -> Callable[[Sink], object]:
+    return lambda sink: sink.write(text.encode("utf-8", "replace"))
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turn an OSError into a DoraSystemdError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        is_refused = isinstance(error, PermissionError)
+        code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+        hint = "use sudo, or -o FILE in a directory of your own" if is_refused else "see df"
+        message = f"cannot write a bundle to {shown(str(path))}: {error.strerror}"
+        raise DoraSystemdError(message, hint, code) from error

@@ -1,0 +1,226 @@
+"""Bundles on disk: whole or not there, and read with care."""
+
+import errno
+import os
+import stat
+import tarfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.bundles import store as stores
+from dora_systemd.adapters.bundles.archive import BLOCK, Archive, Section, Sink
+from dora_systemd.adapters.bundles.reader import opened
+from dora_systemd.adapters.bundles.store import BundleStore, locked, room
+from dora_systemd.decisions.bundles.manifest import MANIFEST, Manifest, format_manifest
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+AT = 1_767_225_600_000_000
+ABOUT = Manifest("robot", "u", "dora-robot.service", "system", "host", AT, "root")
+
+
+def section(name: str, data: bytes) -> Section:
+    return Section(name, lambda sink: sink.write(data))
+
+
+def write(path: Path, *more: Section, most: int = 1 << 20) -> Archive:
+    """A whole bundle."""
+    with Archive(path, most, AT) as archive:
+        for one in (section("README.txt", b"hello"), section("why.json", b"{}"), *more):
+            archive.add(one)
+        about = replace(ABOUT, parts=tuple(archive.parts))
+        archive.add(section(MANIFEST, format_manifest(about).encode()), reserve=0)
+    return archive
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    path = tmp_path / "x.tar"
+    write(path, section("journal.export.gz", bytes(range(256)) * 10))
+    return path
+
+
+def test_it_is_a_tar_file_of_its_owner(bundle: Path) -> None:
+    assert stat.S_IMODE(bundle.stat().st_mode) == 0o600
+    with tarfile.open(bundle) as tar:
+        assert [one.name for one in tar] == [
+            *("README.txt", "why.json", "journal.export.gz", MANIFEST),
+        ]
+        first = tar.extractfile("README.txt")
+        assert first is not None
+        assert first.read() == b"hello"
+    with opened(bundle) as found:
+        found.check()
+        assert found.read("why.json") == b"{}"
+        assert found.read("nothing") == b""
+        assert found.manifest.name == "robot"
+
+
+def fail(sink: Sink) -> None:
+    sink.write(b"half of it")
+    raise DoraSystemdError("cannot read the unit: gone")
+
+
+def broken(sink: Sink) -> None:
+    sink.write(b"half of it")
+    raise KeyError("x")
+
+
+def test_a_section_that_fails_costs_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "x.tar"
+    large = section("large", bytes(1 << 20))
+    archive = write(
+        path, Section("unit.txt", fail), Section("b", broken), large, section("c", b"c")
+    )
+    assert archive.errors == [
+        "unit.txt: cannot read the unit: gone",
+        "b: KeyError: 'x'",
+        f"large: more than {archive.errors[-1].split()[3]} bytes",
+    ]
+    with opened(path) as found:
+        found.check()
+        assert [one.name for one in found.manifest.parts] == ["README.txt", "why.json", "c"]
+
+
+def full(_sink: Sink) -> None:
+    raise OSError(errno.ENOSPC, "no space")
+
+
+def test_a_full_disk_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="no space"):
+        write(tmp_path / "x.tar", Section("journal", full))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_one_leaves_nothing(tmp_path: Path) -> None:
+    def interrupt(_sink: Sink) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "x.tar", Section("journal", interrupt))
+    assert list(tmp_path.iterdir()) == []
+
+
+def trouble(path: Path) -> str:
+    with pytest.raises(DoraSystemdError) as caught, opened(path) as found:
+        found.check()
+    assert caught.value.code is ExitCode.BAD_INPUT
+    assert "\n" not in caught.value.message
+    return caught.value.message
+
+
+def test_one_that_was_cut(bundle: Path) -> None:
+    data = bundle.read_bytes()
+    for size in range(BLOCK, len(data) - BLOCK, 317):
+        bundle.write_bytes(data[:size])
+        assert "it was cut" in trouble(bundle), size
+
+
+def test_one_that_was_changed(bundle: Path) -> None:
+    data = bytearray(bundle.read_bytes())
+    data[BLOCK] ^= 1
+    bundle.write_bytes(data)
+    assert trouble(bundle).endswith("it was changed: README.txt is not what was written")
+
+
+def test_one_with_another_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.tar"
+    with Archive(path, 1 << 20, AT) as archive:
+        archive.add(section("README.txt", b"x"))
+        archive.add(section(MANIFEST, format_manifest(ABOUT).encode()))
+    assert "its files are not those of its manifest.json" in trouble(path)
+
+
+def foreign(kind: bytes, name: str = "README.txt") -> bytes:
+    info = tarfile.TarInfo(name)
+    info.type, info.linkname = kind, "/etc/shadow" if kind == tarfile.SYMTYPE else ""
+    return info.tobuf(tarfile.USTAR_FORMAT)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(b"", b"x", bytes(4096), b"\x1f\x8b" + bytes(2000), os.urandom(4096)),
+        foreign(tarfile.SYMTYPE),
+        foreign(tarfile.DIRTYPE),
+        foreign(tarfile.REGTYPE, "other.txt"),
+        foreign(tarfile.REGTYPE) + foreign(tarfile.REGTYPE, "../x"),
+        foreign(tarfile.REGTYPE) + foreign(tarfile.LNKTYPE, "why.json"),
+        foreign(tarfile.REGTYPE) * 2,
+        foreign(tarfile.REGTYPE) + foreign(tarfile.GNUTYPE_SPARSE, "why.json"),
+        foreign(tarfile.REGTYPE) + b"".join(foreign(tarfile.REGTYPE, f"x{n}") for n in range(300)),
+    ],
+)
+def test_foreign_files(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "x.tar"
+    path.write_bytes(data)
+    assert "as a bundle" in trouble(path)
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    assert "no such file" in trouble(tmp_path / "nothing")
+    assert "directory" in trouble(tmp_path)
+    os.mkfifo(tmp_path / "fifo")
+    assert "not a regular file" in trouble(tmp_path / "fifo")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> BundleStore:
+    return BundleStore(tmp_path, "robot")
+
+
+def test_the_store(store: BundleStore) -> None:
+    assert store.known() == []
+    with locked(store):
+        names = []
+        for stamp in ("20260101T000001Z", "20260101T000000Z", "20260101T000001Z"):
+            path = store.new_path(stamp, "requested")
+            write(path)
+            names.append(path.name)
+        (store.path / ".x.partial").touch()
+        (store.path / "notes.txt").touch()
+        store.remove_partial()
+    assert names[0] != names[2]
+    assert [one.id for one in store.known()] == [names[1], names[0], names[2]]
+    assert {one.event for one in store.known()} == {"requested"}
+    for place in (store.path, store.root):
+        assert stat.S_IMODE(place.stat().st_mode) == 0o700
+    with pytest.raises(DoraSystemdError, match="robot has no bundle x"):
+        store.remove([names[0], "x"])
+    assert len(store.known()) == 3
+    store.remove(names)
+    assert store.known() == []
+    assert [path.name for path in store.path.iterdir()] == ["notes.txt"]
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """The free blocks of a disk of 1,000 blocks of 1 MiB."""
+    free = [900]
+
+    def answer(_path: object) -> os.statvfs_result:
+        values = (1 << 20, 1 << 20, 1000, free[0], free[0], 1, 1, 1, 0, 255)
+        return os.statvfs_result(values)
+
+    monkeypatch.setattr(os, "statvfs", answer)
+    yield free
+
+
+def test_a_bundle_leaves_some_of_the_disk(disk: list[int], tmp_path: Path) -> None:
+    assert room(tmp_path) == 750 << 20
+    disk[0] = 151
+    assert room(tmp_path) == 1 << 20
+    disk[0] = 150
+    with pytest.raises(DoraSystemdError, match="only 150M of the disk free") as caught:
+        room(tmp_path)
+    assert caught.value.hint == "a bundle leaves 150M free; see df"
+
+
+def test_what_cannot_be_used(tmp_path: Path) -> None:
+    (tmp_path / "dora-systemd").touch()
+    with pytest.raises(DoraSystemdError, match="cannot use"), locked(BundleStore(tmp_path, "a")):
+        pass
+    refused = stores.unusable(tmp_path, PermissionError(errno.EACCES, "Permission denied"))
+    assert (refused.code, refused.hint) == (ExitCode.NO_PERMISSION, "use sudo, or -o FILE")

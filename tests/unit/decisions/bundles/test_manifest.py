@@ -1,0 +1,100 @@
+"""The manifest of a bundle, also one that somebody else has written."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.bundles.manifest import (
+    MOST_PARTS,
+    SCHEMA,
+    Manifest,
+    Part,
+    format_manifest,
+    is_part_name,
+    parse_manifest,
+)
+from dora_systemd.decisions.bundles.readme import ANNOUNCEMENT, format_readme
+from dora_systemd.decisions.bundles.table import BundleRow, bundle_object, format_bundles
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+ONE = Manifest(
+    *("robot", "u-u-i-d", "dora-robot.service", "system", "arm-3", 1_767_225_600_000_000),
+    by="root (doractl bundle)",
+    node="camera",
+    cause="node-failed",
+    summary="node camera: exit code 1",
+    versions={"doractl": "0.1.0", "dora": None},
+    left_out=("recording.mcap: nothing was recorded",),
+    parts=(Part("README.txt", 5, "0" * 64), Part("stacks/camera.txt", 7, "a" * 64)),
+)
+
+
+def test_there_and_back() -> None:
+    assert parse_manifest(format_manifest(ONE).encode(), "x.tar") == ONE
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"kind": "x"}', "[" * 100_000, "\xff"])
+def test_something_else(text: str) -> None:
+    with pytest.raises(DoraSystemdError, match=r"cannot read x\.tar as a bundle: its") as caught:
+        parse_manifest(text.encode("latin-1"), "x.tar")
+    assert caught.value.code is ExitCode.BAD_INPUT
+    assert "\n" not in caught.value.message
+
+
+def test_a_newer_one() -> None:
+    values = {"kind": json.loads(format_manifest(ONE))["kind"], "schema": SCHEMA + 1}
+    with pytest.raises(DoraSystemdError, match="a newer doractl has written it"):
+        parse_manifest(json.dumps(values).encode(), "x.tar")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("name", 1), ("at_us", -1), ("at_us", True), ("parts", {}), ("parts", [[]])),
+        ("parts", [{"name": "../x", "size": 1, "digest": "0" * 64}]),
+        ("parts", [{"name": "x", "size": 1, "digest": "0"}]),
+        ("parts", [{"name": "x", "size": 2**70, "digest": "0" * 64}]),
+        ("parts", [{"name": "x", "size": 1, "digest": "0" * 64}] * (MOST_PARTS + 1)),
+        *(("left_out", [1]), ("versions", {"x": 1})),
+    ],
+)
+def test_wrong_values(key: str, value: Any) -> None:
+    values = {**json.loads(format_manifest(ONE)), key: value}
+    if key == "parts" and not value:
+        values["parts"] = [value]
+    with pytest.raises(DoraSystemdError, match="wrong values"):
+        parse_manifest(json.dumps(values).encode(), "x.tar")
+
+
+def test_names_of_parts() -> None:
+    for name in ("README.txt", "stacks/camera-1.txt", "recording.mcap"):
+        assert is_part_name(name)
+    for name in ("", "/etc/x", "../x", "a/../b", ".hidden", "a/b/c", "a\nb", "a/", "ü", "x" * 300):
+        assert not is_part_name(name)
+
+
+def test_the_readme_announces_what_nodes_have_written() -> None:
+    text = format_readme(ONE, "robot: Failed", ["why.json", "stacks/camera.txt"], True)
+    assert text.startswith("Bundle of dataflow robot on arm-3, 2026-01-01T00:00:00")
+    assert "\n\nrobot: Failed\n\n" in text
+    assert ANNOUNCEMENT in text
+    assert "stacks/" in text
+    assert "unit.txt" not in text
+    without = format_readme(ONE, "robot: Failed", ["why.json"], False)
+    assert ANNOUNCEMENT not in without
+    assert "--no-journal" in without
+
+
+def test_the_table() -> None:
+    row = BundleRow("robot", "robot-1.tar", "/x/robot-1.tar", "requested", 2048, ONE)
+    broken = row._replace(manifest=None)
+    title, first, second = format_bundles([row, broken]).splitlines()
+    assert title.split() == ["NAME", "BUNDLE", "WRITTEN", "EVENT", "SIZE", "WHY"]
+    assert first.endswith("requested  2K    node camera: exit code 1")
+    assert second.endswith("it cannot be read")
+    found = bundle_object(row)
+    assert (found["at_us"], found["cause"], found["size_bytes"]) == (ONE.at_us, ONE.cause, 2048)
+    assert found.keys() == bundle_object(broken).keys()
+    assert bundle_object(row._replace(manifest=replace(ONE, node="")))["node"] is None

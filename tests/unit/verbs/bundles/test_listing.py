@@ -1,0 +1,26 @@
+"""What is printed of bundles, which anybody may have written."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.verbs.bundles.listing import find_name, kept_names, parse_why, shown_readme
+from tests.unit.fakes.manager import FakeManager, ScopeIn
+
+
+def test_no_text_of_a_bundle_controls_the_terminal(tmp_path: Path) -> None:
+    assert "\x1b" not in shown_readme("a\x1b]0;x\x07\nb\n", 80)
+    for data in (b"", b"{", b"\xff", b"[" * 100_000):
+        with pytest.raises(DoraSystemdError, match="is not JSON"):
+            parse_why(data, tmp_path / "x")
+    assert json.dumps(parse_why(b"[]", tmp_path)) == "{}"
+
+
+def test_a_dataflow_is_known_by_its_bundles(scope: ScopeIn, manager: FakeManager) -> None:
+    assert kept_names(scope) == []
+    (scope.state_root / "dora-systemd/bundles/robot").mkdir(parents=True)
+    (scope.state_root / "dora-systemd/bundles/.x").mkdir()
+    assert kept_names(scope) == ["robot"]
+    assert find_name(manager, scope, "dora-robot.service") == "robot"

@@ -1,0 +1,97 @@
+"""`doractl bundle` of a dataflow that only the journal knows, and what is printed of it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.bundles.reader import opened
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.bundles.listing import (
+    find_name,
+    kept_names,
+    parse_why,
+    read_bundles,
+    read_report,
+    remove_bundles,
+)
+from dora_systemd.verbs.bundles.write import write_bundle
+from tests.unit.fakes.cgroups import fake_cgroups
+from tests.unit.fakes.journal import FakeJournal, life_record
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.fakes.programs import make_dora, make_program
+
+SECRET = "hunter2"
+
+Reach = Callable[[Scope], FakeManager]
+
+
+@pytest.fixture
+def reach(manager: FakeManager, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Reach:
+    """A machine on which robot has failed; systemd still has its unit."""
+    fake_cgroups(monkeypatch, tmp_path)
+    journal = FakeJournal(monkeypatch, tmp_path)
+    more = {"_SYSTEMD_INVOCATION_ID": "1", "_CMDLINE": SECRET, "MESSAGE": "it has ended"}
+    failed = {"DORA_EVENT": "dataflow-failed", "DORA_REASON": "node camera: exit code 3"}
+    journal.write(
+        {**life_record("dataflow-failed", 9), **failed, **more},
+        {**life_record("dataflow-starting", 5), **more},
+    )
+    make_dora(tmp_path / "bin/dora", "1.1.0")
+    make_program(tmp_path / "bin/systemd-analyze")
+    monkeypatch.setenv("PATH", f"{tmp_path}/journal:{tmp_path}/bin:/usr/bin:/bin")
+    manager.types = {"NRestarts": "u", "Environment": "as"}
+    manager.add(options(), ActiveState="failed", SubState="failed")
+    manager.units["dora-robot.service"]["Environment"] = [f"KEY={SECRET}"]
+
+    def reached(_scope: Scope) -> FakeManager:
+        return manager
+
+    return reached
+
+
+def test_a_bundle(reach: Reach, scope: ScopeIn, manager: FakeManager) -> None:
+    done = write_bundle(reach, scope, "robot", "doractl bundle")
+    assert done.path.parent == scope.state_root / "dora-systemd/bundles/robot"
+    assert done.errors == ()
+    with opened(done.path) as bundle:
+        bundle.check()
+        names = [one.name for one in bundle.manifest.parts]
+        data = b"".join(map(bundle.read, names))
+        assert bundle.manifest.by.endswith("(doractl bundle)")
+        assert bundle.manifest.left_out[0] == (
+            "cgroup.json and nodes.json: the dataflow does not run"
+        )
+    assert SECRET.encode() not in data
+    assert b"Environment=KEY\n" in data
+    readme, why = read_report(done.path)
+    assert "robot: Failed" in readme
+    assert parse_why(why, done.path)["name"] == "robot"
+    assert kept_names(scope) == ["robot"]
+    assert find_name(manager, scope, "robot") == "robot"
+    (row,) = read_bundles(scope, ["robot"])
+    assert row.manifest
+    assert row.manifest.uuid == options().uuid
+    assert list(remove_bundles(scope, "robot", [row.id])) == [row.id]
+    assert read_bundles(scope, ["robot"]) == []
+
+
+def test_another_place(reach: Reach, scope: ScopeIn, tmp_path: Path) -> None:
+    place = tmp_path / "out.tar"
+    done = write_bundle(reach, scope, "robot", "x", place, want_journal=False)
+    assert done.path == place
+    with opened(place) as bundle:
+        assert "journal.export.gz" not in [one.name for one in bundle.manifest.parts]
+        assert bundle.manifest.left_out[0].endswith("--no-journal")
+    assert kept_names(scope) == []
+    with pytest.raises(DoraSystemdError, match="No such file") as caught:
+        write_bundle(reach, scope, "robot", "x", tmp_path / "a/b.tar")
+    assert caught.value.code is ExitCode.FAILURE
+
+
+def test_an_unknown_one(reach: Reach, scope: ScopeIn) -> None:
+    with pytest.raises(DoraSystemdError, match="no dataflow named 'rover'"):
+        write_bundle(reach, scope, "rover", "x")
+    with pytest.raises(DoraSystemdError, match="has no bundle x"):
+        list(remove_bundles(scope, "robot", ["x"]))
