@@ -166,8 +166,6 @@ class Runs:
         from dora_systemd.runner.recorder.keep import Rings
 
         self.rings = Rings(inherited)
-        if self.role.options.of_dataflow("record") is None:
-            self.rings.free()
 
 
 def role_of(options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> Alone:
@@ -193,6 +191,8 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     beside.spawn("count restarts", learn_first(runs.this_life, options.name, is_user))
     role = runs.role
     answer = Recheck(role, runs.environment, NodeRequests(runs.reloader, role).answer).answer
+    if runs.rings is not None:
+        answer = partial(runs.rings.answer, others=answer)
     socket = serve(runs.paths.socket, answer, reach, role.sessions, role.door)
     beside.spawn("serve its socket", socket)
     if "WATCHDOG_USEC" in os.environ:
@@ -294,7 +294,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             from dora_systemd.runner.owes.watch import watch_owes
 
             dialogue.spawn("watch what nodes owe", watch_owes(run, prepared, dora, dialogue))
-        if runs.rings is not None and options.of_dataflow("record") is not None:
+        if runs.rings is not None:
             from dora_systemd.runner.recorder.keep import keep_recorder
 
             dialogue.spawn("record", keep_recorder(run, prepared, dora, runs.rings))

@@ -19,6 +19,7 @@ from dora_systemd.decisions.cell.environment import changes_entry, changes_of, w
 from dora_systemd.decisions.cell.line_rates import RateLimits, format_rates, rates_of
 from dora_systemd.decisions.cell.options import SettingText, changed
 from dora_systemd.decisions.properties.assignments import typed
+from dora_systemd.decisions.recorder.record import format_record, parse_record
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of
@@ -65,6 +66,26 @@ def switch_hot_reload(
         manager.reload()
         ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
         undo.pop_all()
+
+
+def switch_record(
+    manager: Manager, scope: Scope, cell: Cell, text: str, ask: Ask = order
+) -> tuple[str, ...]:
+    """Change what the recorder keeps; this outlasts restarts of the unit. Return warnings.
+
+    text: of the setting `record`. Raises DoraSystemdError.
+    """
+    require_running(cell)
+    refuse_parts([cell], "set")
+    what, has_recorder = format_record(parse_record(text)), cell.options.has("record")
+    unit = manager.read(cell.unit, ("Environment", "FragmentPath", "Transient"))
+    with ExitStack() as undo:
+        remember(unit, [SettingText("", "record", what)], undo)
+        manager.reload()
+        if has_recorder:
+            ask(socket_of(scope, cell), {"verb": "record", "what": what})
+        undo.pop_all()
+    return () if has_recorder else (f"{cell.name} was started without record: restart it",)
 
 
 def remember(unit: Mapping[str, Any], changes: Iterable[SettingText], undo: ExitStack) -> None:

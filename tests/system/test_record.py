@@ -1,6 +1,5 @@
 """The recorder with real dora and systemd: what its ring has after everything has died."""
 
-import contextlib
 import io
 import json
 import os
@@ -14,6 +13,7 @@ import pytest
 
 from dora_systemd.decisions.recorder.reading import Reading, Recorded
 from dora_systemd.decisions.recorder.recording import write_recording
+from dora_systemd.trust.rings import find_ring
 from tests.system.cells import Cell, Project, wait_for
 from tests.unit.fakes.recorder.mcap import File
 
@@ -41,24 +41,26 @@ LARGE = "dora-rs/dora#2742"
 
 
 class Ring:
-    """The ring that systemd keeps."""
+    """The ring that systemd keeps, of the dataflow that was started last."""
+
+    uuid, uid = "", 0
 
     def __init__(self) -> None:
-        self.fd = -1
-        for one in Path("/proc/1/fd").iterdir():
-            with contextlib.suppress(FileNotFoundError):  # PID 1 closes others at any moment
-                if "memfd:dora-ring" in str(one.readlink()):
-                    self.fd = os.open(one, os.O_RDONLY)
+        self.file = find_ring([1], self.uuid, self.uid)
 
-    def read(self, at: int, size: int) -> bytes:
-        return os.pread(self.fd, size, at)
+    def __bool__(self) -> bool:
+        return self.file is not None
+
+    def __del__(self) -> None:
+        if self.file is not None:
+            self.file.close()
 
     def reading(self) -> Reading:
-        assert self.fd >= 0
-        return Reading(self, os.fstat(self.fd).st_size, 1 << 30)
+        assert self.file is not None
+        return Reading(self.file, self.file.size, 1 << 30)
 
     def messages(self) -> list[Recorded]:
-        return list(self.reading().messages()) if self.fd >= 0 else []
+        return list(self.reading().messages()) if self else []
 
     def last(self) -> int:
         """The number of the last message."""
@@ -67,7 +69,17 @@ class Ring:
 
     @property
     def used(self) -> int:
-        return os.fstat(self.fd).st_blocks * 512
+        assert self.file is not None
+        return self.file.used
+
+
+def has_more(last: int) -> bool:
+    return Ring().last() > last
+
+
+def start(cell: Cell, path: Path, *words: str) -> None:
+    cell.start(path, *words)
+    Ring.uuid, Ring.uid = cell.status.uuid, cell.paths.root.stat().st_uid
 
 
 def flow(project: Project, record: Any) -> Path:
@@ -87,7 +99,7 @@ def file_of(ring: Ring) -> File:
 def test_by_default_the_last_message_of_all_outputs_and_more_of_small_ones(
     cell: Cell, project: Project
 ) -> None:
-    cell.start(flow(project, True))
+    start(cell, flow(project, True))
     wait_for("messages are recorded", lambda: len(Ring().messages()) > 100)
     ring = Ring()
     file = file_of(ring)
@@ -99,13 +111,13 @@ def test_by_default_the_last_message_of_all_outputs_and_more_of_small_ones(
     assert ring.used < 1024 * 1024
     assert "dora-systemd-recorder" not in cell.doractl("list", cell.name).stdout
     cell.doractl("stop", cell.name)
-    assert Ring().fd < 0, "its memory is free"
+    assert not Ring(), "its memory is free"
 
 
 @pytest.mark.warns(LARGE)
 def test_named_outputs_in_their_memory(cell: Cell, project: Project) -> None:
-    cell.start(flow(project, {"memory": "4M", "outputs": ["camera/image"]}))
-    wait_for("it is full", lambda: Ring().fd >= 0 and Ring().reading().states[0].evicted > 20)
+    start(cell, flow(project, {"memory": "4M", "outputs": ["camera/image"]}))
+    wait_for("it is full", lambda: Ring() and Ring().reading().states[0].evicted > 20)
     assert list(Ring().reading().header.outputs) == ["camera/image"]
     assert 8 <= len(file_of(Ring()).messages) // 2 <= 10
     assert Ring().used <= 4.2 * 1024 * 1024
@@ -124,15 +136,32 @@ def test_what_cannot_be_recorded(cell: Cell, project: Project) -> None:
         assert done.returncode in (2, 5), done.stderr
 
 
+@pytest.mark.warns(LARGE)
+def test_it_is_changed_while_it_runs(cell: Cell, project: Project) -> None:
+    start(cell, flow(project, {"memory": "8M", "outputs": ["camera/image"]}))
+    wait_for("it records", partial(has_more, 20))
+    refused = cell.doractl("set", cell.name, "--record", "outputs=camera/imge", check=False)
+    assert "cannot record 'camera/imge': no such output" in refused.stderr
+    assert Ring().last() > 20
+    done = cell.doractl("set", cell.name, "--record", "off").stdout
+    assert done.startswith("Recorder changed: ")
+    wait_for("its memory is free", lambda: not Ring())
+    wait_for("it is gone", lambda: not cell.pids("node-dora-systemd-recorder"))
+    cell.doractl("restart", cell.name)
+    assert not Ring()
+    cell.doractl("set", cell.name, "--record", "memory=4M")
+    wait_for("it records again", partial(has_more, 20))
+    assert len(Ring().reading().header.outputs) == 2
+    cell.doractl("restart", cell.name)
+    wait_for("it goes on", partial(has_more, 20))
+    assert Ring().reading().header.budget == 4 * 1024 * 1024
+
+
 ROUNDS = int(os.environ.get("KILLS", "4"))
 KILLED = (
     *("killed", "signal", "SIGKILL", "is lost", "failed", "crashed", "restart"),
     *("exited with error", "Failed with result", "nobody records", LARGE, "connection"),
 )
-
-
-def has_more(last: int) -> bool:
-    return Ring().last() > last
 
 
 def victim(cell: Cell, who: str) -> int:
@@ -149,7 +178,7 @@ def victim(cell: Cell, who: str) -> int:
 def test_after_a_kill_it_is_all_there(cell: Cell, project: Project, who: str) -> None:
     path = flow(project, {"memory": "8M", "outputs": ["camera/image", "camera/count"]})
     words = "--restart-policy", "on-failure", "--max-restarts", "100000", "--restart-delay", "500ms"
-    cell.start(path, *words)
+    start(cell, path, *words)
     last, seed = 0, random.Random(who)
     for _ in range(ROUNDS):
         more = last + seed.randrange(10, 40)

@@ -20,7 +20,7 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import require_running
 from dora_systemd.verbs.releases.listing import refuse_on_trial
-from dora_systemd.verbs.reload import switch_hot_reload
+from dora_systemd.verbs.reload import switch_hot_reload, switch_record
 from dora_systemd.verbs.set import set_limits
 
 
@@ -28,10 +28,17 @@ from dora_systemd.verbs.set import set_limits
 @click.argument("selector")
 @live_options
 @click.option("--hot-reload", type=click.Choice(["on", "off"]), help="Turn hot reload on or off.")
+@click.option(
+    "--record",
+    metavar="last=TIME,memory=SIZE,...",
+    help="What the recorder keeps from now on; off gives its memory back.",
+)
 @click.option("--force", is_flag=True, help="Set a memory limit below the current usage, too.")
 @acting_options
-def command(selector: str, hot_reload: str | None, force: bool, **flags: Any) -> int:
-    """Change limits or hot reload of a running dataflow.
+def command(
+    selector: str, hot_reload: str | None, record: str | None, force: bool, **flags: Any
+) -> int:
+    """Change limits, hot reload or the recorder of a running dataflow.
 
     Changes take effect at once and survive restarts, until the dataflow is stopped; those of an
     enabled dataflow, until it is disabled: if it does not run, its next start has new limits.
@@ -43,24 +50,34 @@ def command(selector: str, hot_reload: str | None, force: bool, **flags: Any) ->
       doractl set robot --cpu-limit infinity
       doractl set robot --log-rate-limit camera=10/1s
       doractl set robot --hot-reload on
+      doractl set robot --record off
     """
     scope = current_scope()
     bus = Bus(scope)
     cell = Selector(selector).find_present(bus, scope)
     refuse_on_trial(scope, cell, "set")
-    if hot_reload is not None:
+    if hot_reload is not None or record is not None:
         require_running(cell)
-    done = _changes(bus, scope, cell, hot_reload, flags, force)
+    done = _changes(bus, scope, cell, hot_reload, record, flags, force)
     return print_outcomes(Outcome(cell, f"{one}: {cell.uuid} ({cell.name})") for one in done)
 
 
 def _changes(
-    bus: Bus, scope: Scope, cell: Cell, hot_reload: str | None, flags: dict[str, Any], force: bool
+    bus: Bus,
+    scope: Scope,
+    cell: Cell,
+    hot_reload: str | None,
+    record: str | None,
+    flags: dict[str, Any],
+    force: bool,
 ) -> Iterator[str]:
     """Make each change, then yield it."""
-    if hot_reload is None or any(map(is_given, flags.values())):
+    if (hot_reload is None and record is None) or any(map(is_given, flags.values())):
         print_warnings(set_limits(bus, scope, cell, flags, force))
         yield "Limits changed" if cell.has_begun else "Limits changed for the next start"
     if hot_reload is not None:
         switch_hot_reload(bus, scope, cell, hot_reload == "on")
         yield f"Hot reload {hot_reload}"
+    if record is not None:
+        print_warnings(switch_record(bus, scope, cell, record))
+        yield "Recorder changed"

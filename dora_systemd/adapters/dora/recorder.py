@@ -14,9 +14,14 @@ def recorder_python(plan: LaunchPlan) -> str:
     return probe_python(plan, purpose=_PURPOSE)
 
 
+def total_memory() -> int:
+    """Bytes of memory of this machine."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
 def check_recorder(plan: LaunchPlan) -> None:
     """Raise DoraSystemdError (BAD_INPUT) if the recorder has no Python, or no memory."""
     record = plan.options.of_dataflow("record")
     if record is not None:
-        check_memory(record, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        check_memory(record, total_memory())
         recorder_python(plan)

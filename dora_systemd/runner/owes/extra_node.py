@@ -32,7 +32,7 @@ class ExtraNode:
     """
 
     def __init__(self, run: Run, dora: Engine, name: str, longest: int = LATE) -> None:
-        self._run, self._engine, self._longest = run, dora, longest
+        self._run, self._engine, self._name, self._longest = run, dora, name, longest
         self.group = run.nodes.places[0] / f"{cgroup.NODE_PREFIX}{name}"
         self.count = 0
         self._next_us, self._pause = 0, _SOON
@@ -72,6 +72,17 @@ class ExtraNode:
             return error.message
         except OSError as error:
             return f"its group: {error.strerror}"
+
+    async def remove(self, grace: int) -> None:
+        """Have dora end the node, and kill it if dora does not. grace: µs."""
+        ident = f"{self._name}.{self.count}"
+        params = protocol.node_params("RemoveNode", self._run.pump.cell.run, ident, grace)
+        try:
+            reply = await self._engine.ask_apart(params, _ANSWER_SECONDS)
+        except DoraSystemdError:
+            reply = None
+        if reply is None or reply.error:
+            self.kill()
 
     def kill(self) -> None:
         """Kill the node."""

@@ -12,12 +12,22 @@ from typing import Any
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
-from dora_systemd.adapters.dora.recorder import recorder_python
+from dora_systemd.adapters.dora.recorder import recorder_python, total_memory
+from dora_systemd.adapters.runner_socket.client import Request
+from dora_systemd.adapters.runner_socket.listener import Answer
 from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.owes.extra_node import extra_definition
-from dora_systemd.decisions.recorder.record import RECORDER, ROOM, Record, recorded_outputs
+from dora_systemd.decisions.recorder.record import (
+    RECORDER,
+    ROOM,
+    Record,
+    check_memory,
+    check_record,
+    parse_record,
+    recorded_outputs,
+)
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.owes.extra_node import ExtraNode, can_come
@@ -37,6 +47,9 @@ QUEUE = 30
 _TICK = SECOND
 _LONGEST_PAUSE = 8 * SECOND
 """µs in which nothing is recorded, if recorders end again and again."""
+_GRACE = SECOND
+_PATIENCE = 3
+"""Ticks in which a recorder without inputs ends by itself."""
 _WEIGHT = 10
 """cpu.weight; other groups have 100."""
 _VARIABLES = {"RUST_LOG": "warn"}
@@ -48,31 +61,75 @@ class Rings:
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
+        self.record: Record | None = None
+        self.changed = asyncio.Event()
+        self.prepared: Prepared | None = None
+        self._given: Record | None = None
 
     def free(self) -> None:
         """Give the memory back."""
         free_ring(self.fd)
         self.fd = -1
 
+    def begin(self, prepared: Prepared) -> None:
+        """Obey the options of a run, unless `doractl set` has changed the setting since."""
+        self.prepared, given = prepared, prepared.plan.options.of_dataflow("record")
+        if given != self._given:
+            self._given = self.record = given
+
+    async def answer(self, request: Request, others: Answer) -> dict[str, Any]:
+        """Answer {"verb": "record", "what": text of the setting}. others: answers all else.
+
+        Raises DoraSystemdError.
+        """
+        if request.get("verb") != "record":
+            return await others(request)
+        if (prepared := self.prepared) is None:
+            raise DoraSystemdError("cannot change what is recorded: no node runs")
+        record = parse_record(str(request.get("what")))
+        check_record(record, prepared.plan.options, prepared.dataflow.nodes)
+        if record is not None:
+            check_memory(record, total_memory())
+        self.record = record
+        self.changed.set()
+        return {"done": []}
+
 
 async def keep_recorder(run: Run, prepared: Prepared, dora: Engine, rings: Rings) -> None:
-    """Record what the options of `prepared` name, from the start of all nodes on."""
-    options = prepared.plan.options
-    record = options.of_dataflow("record")
+    """Record what `rings` has, from the start of all nodes on."""
+    rings.begin(prepared)
     await run.pump.wait(lambda cell: cell.state is State.RUNNING, None)
-    find_python = partial(asyncio.to_thread, recorder_python, prepared.plan)
-    outputs = recorded_outputs(record, options, prepared.dataflow.nodes)
-    if not outputs:
+    while True:
+        rings.changed.clear()
+        try:
+            await _record_until_changed(run, prepared, dora, rings)
+        except (OSError, DoraSystemdError) as error:
+            reason = error.message if isinstance(error, DoraSystemdError) else error.strerror
+            run.pipes.write_event("outputs-unrecorded", reason=f"{reason}")
+        await rings.changed.wait()
+
+
+async def _record_until_changed(run: Run, prepared: Prepared, dora: Engine, rings: Rings) -> None:
+    """Record until another value of the setting comes. Raises OSError and DoraSystemdError."""
+    plan, record = prepared.plan, rings.record
+    outputs = recorded_outputs(record, plan.options, prepared.dataflow.nodes) if record else ()
+    if record is None or not outputs:
+        rings.free()
         return
-    try:
-        rings.fd = fitted_ring(rings.fd, header_of(record, outputs, _facts(options)))
-        ring = RingSocket(run.nodes.places[1].ring, rings.fd)
-    except (OSError, DoraSystemdError) as error:
-        reason = error.message if isinstance(error, DoraSystemdError) else error.strerror
-        run.pipes.write_event("outputs-unrecorded", reason=f"{reason}")
-        return
-    with closing(ring):
-        await Recorder(run, dora, prepared.plan, record, outputs, find_python).work()
+    rings.fd = fitted_ring(rings.fd, header_of(record, outputs, _facts(plan.options)))
+    find_python = partial(asyncio.to_thread, recorder_python, plan)
+    with closing(RingSocket(run.nodes.places[1].ring, rings.fd)):
+        recorder = Recorder(run, dora, plan, record, outputs, find_python)
+        work = asyncio.create_task(recorder.work())
+        change = asyncio.create_task(rings.changed.wait())
+        try:
+            await asyncio.wait((work, change), return_when=asyncio.FIRST_COMPLETED)
+            if work.done():
+                work.result()
+            await recorder.end()
+        finally:
+            work.cancel()
+            change.cancel()
 
 
 def _facts(options: RunnerOptions) -> dict[str, str]:
@@ -99,6 +156,7 @@ class Recorder:
         self._run, self._plan, self._record = run, plan, record
         self._outputs, self._find_python = outputs, find_python
         self._node = ExtraNode(run, dora, RECORDER, _LONGEST_PAUSE)
+        self._idle = 0
         self._is_told = False
 
     async def work(self) -> None:
@@ -108,10 +166,16 @@ class Recorder:
             await self._tend(int(loop.time() * SECOND))
             await asyncio.sleep(_TICK / SECOND)
 
+    async def end(self) -> None:
+        """End the recorder, which another one replaces or nobody needs any more."""
+        if self._node.is_there:
+            await self._node.remove(_GRACE)
+
     async def _tend(self, now: int) -> None:
         inputs = self._inputs()
         if self._node.is_there:
-            if not inputs:
+            self._idle = 0 if inputs else self._idle + 1
+            if self._idle > _PATIENCE:
                 self._node.kill()  # the dataflow would not finish without it
             elif self._node.rest(now):
                 self._is_told = False

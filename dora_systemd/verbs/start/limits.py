@@ -7,6 +7,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, has_cpus, limits_of, without_cpus
 from dora_systemd.decisions.properties.assignments import Properties
+from dora_systemd.decisions.recorder.record import check_memory
 from dora_systemd.decisions.settings.limit_checks import (
     Machine,
     check_controllers,
@@ -15,6 +16,7 @@ from dora_systemd.decisions.settings.limit_checks import (
     size_warnings,
 )
 from dora_systemd.decisions.settings.limits import DEVICE, NICE
+from dora_systemd.decisions.settings.record import RECORD
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.values import cpu_numbers, parse_cpus
@@ -31,6 +33,8 @@ def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[
     """
     nodes, machine = limits_of(plan.options), read_machine()
     check_cpus(nodes, machine)
+    if record := plan.settings[RECORD]:
+        check_memory(record, machine.memory)
     # Without a cpuset controller the launcher binds nodes to their CPUs.
     require_controllers(manager, plan.scope, properties, tuple(map(without_cpus, nodes)))
     values = {limit.word: plan.settings.values[key] for key, limit in BY_KEY.items()}

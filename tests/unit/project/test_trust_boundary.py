@@ -45,7 +45,7 @@ OTHERWISE = (
 _TABLE = {
     DOOR: """
         trust.courier trust.eyes trust.files trust.locks trust.paths trust.project trust.programs
-        trust.requests trust.sight trust.sockets trust.terminals trust.tree
+        trust.requests trust.rings trust.sight trust.sockets trust.terminals trust.tree
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh cli.main

@@ -155,14 +155,50 @@ def test_too_many_outputs_are_reported(tmp_path: Path) -> None:
     async def begin() -> None:
         bench.append(Bench(tmp_path))
         names = "+".join(f"a/o{at}" for at in range(300))
-        text = SettingText("", "record", f"outputs={names}")
-        plan = bench[0].prepared.plan
-        options = plan.options._replace(settings=(text,))
-        prepared = replace(bench[0].prepared, plan=replace(plan, options=options))
-        await keep_recorder(bench[0].run_of_it(), prepared, bench[0].dora, Rings(-1))
+        prepared = prepared_with(bench[0], f"outputs={names}")
+        recording = keep_recorder(bench[0].run_of_it(), prepared, bench[0].dora, Rings(-1))
+        task = asyncio.create_task(recording)
+        await asyncio.sleep(5)
+        task.cancel()
 
     live(begin)
     assert bench[0].reasons() == ["cannot record all outputs: too many outputs, or too long names"]
+
+
+def prepared_with(bench: Bench, text: str) -> Any:
+    plan = bench.prepared.plan
+    options = plan.options._replace(settings=(SettingText("", "record", text),))
+    return replace(bench.prepared, plan=replace(plan, options=options))
+
+
+def test_doractl_set_changes_what_is_recorded(tmp_path: Path) -> None:
+    async def others(request: Any) -> dict[str, Any]:
+        return {"others": request["verb"]}
+
+    async def begin() -> None:
+        bench, rings = Bench(tmp_path), Rings(-1)
+        with pytest.raises(DoraSystemdError, match="no node runs"):
+            await rings.answer({"verb": "record", "what": "no"}, others)
+        prepared = prepared_with(bench, "memory=2M")
+        recording = keep_recorder(bench.run_of_it(), prepared, bench.dora, rings)
+        task = asyncio.create_task(recording)
+        await asyncio.sleep(5)
+        assert rings.record == Record(memory=2 * MEGABYTE)
+        assert rings.fd == -1, "its nodes have no outputs"
+        for what, words in (("outputs=a/x", "no such output"), ("memory=100T", "100T"), ("?", "?")):
+            with pytest.raises(DoraSystemdError) as caught:
+                await rings.answer({"verb": "record", "what": what}, others)
+            assert words in caught.value.message
+        assert rings.record == Record(memory=2 * MEGABYTE)
+        assert await rings.answer({"verb": "reload"}, others) == {"others": "reload"}
+        assert await rings.answer({"verb": "record", "what": "no"}, others) == {"done": []}
+        rings.begin(prepared)  # a reload with the same options
+        assert [rings.record] == [None]
+        rings.begin(prepared_with(bench, "memory=3M"))
+        assert rings.record == Record(memory=3 * MEGABYTE)
+        task.cancel()
+
+    live(begin)
 
 
 def test_whoever_connects_gets_the_ring(tmp_path: Path) -> None:
