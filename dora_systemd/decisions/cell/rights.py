@@ -168,14 +168,9 @@ def rights_of(options: RunnerOptions) -> tuple[NodeRights, ...]:
     )
 
 
-def is_essential(rights: Iterable[NodeRights], node: str) -> bool:
-    """Whether the final failure of `node` ends the dataflow."""
-    return node in essential_nodes(rights)
-
-
-def essential_nodes(rights: Iterable[NodeRights]) -> tuple[str, ...]:
-    """The nodes whose final failure ends the dataflow."""
-    return tuple(one.node for one in rights if one.essential)
+def essential_nodes(options: RunnerOptions) -> tuple[str, ...]:
+    """The nodes whose final failure ends the dataflow. Raises DoraSystemdError."""
+    return tuple(node for node, value in options.by_node("essential").items() if value)
 
 
 def has_process_rights(rights: Iterable[NodeRights]) -> bool:

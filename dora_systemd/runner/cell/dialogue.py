@@ -13,7 +13,7 @@ from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import is_probe
-from dora_systemd.decisions.cell.rights import is_essential, rights_of
+from dora_systemd.decisions.cell.rights import essential_nodes, rights_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
@@ -184,7 +184,7 @@ class Dialogue(Tasks):
         if isinstance(event, life.NodeExited):
             node = self._pump.cell.nodes.get(event.node)
             is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
-            essential = is_essential(rights_of(self._options), event.node)
+            essential = event.node in essential_nodes(self._options)
             oom = self._nodes.find_oom(event.node)
             event = life_events.with_facts(event, is_stale, oom, essential)
             if node is not None and not is_stale:

@@ -24,7 +24,7 @@ from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import format_missing, members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import restart_of
-from dora_systemd.decisions.cell.rights import is_essential, rights_of
+from dora_systemd.decisions.cell.rights import essential_nodes
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import life_events, protocol
@@ -329,7 +329,7 @@ class HeadDialogue(Dialogue):
             self._tell_exit(event.node)
             event = replace(event, pid=0)  # here another process has that number
         if isinstance(event, life.NodeExited):
-            essential = is_essential(rights_of(self._options), event.node)
+            essential = event.node in essential_nodes(self._options)
             self._exits[event.node] = life_events.with_facts(event, False, None, essential)
             wait = _WORD_SECONDS if self._is_unexplained(event.node) else _NOTE_SECONDS
             self._loop.call_later(wait, self._tell_exit, event.node)

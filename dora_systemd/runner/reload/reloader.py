@@ -19,7 +19,7 @@ from dora_systemd.adapters.runner_socket.client import unknown_request
 from dora_systemd.decisions.cell.limits import check_nodes, limits_of
 from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates, rate_texts
 from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, changed
-from dora_systemd.decisions.cell.rights import essential_nodes, rights_of
+from dora_systemd.decisions.cell.rights import essential_nodes
 from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -179,7 +179,7 @@ class Reloader:
         self._untold = error if self._run is None else None
         self.notice = f"not reloaded: {error.message.removeprefix('cannot use ')}"
         if self._run is not None:
-            needed = essential_nodes(rights_of(self.options))
+            needed = essential_nodes(self.options)
             self._run.pump.push(life.ReloadNoted(now_us(), self.notice, essential=needed))
             hint = f" ({error.hint})" if error.hint else ""
             self._run.pipes.write_event("reload-failed", reason=error.message + hint)

@@ -8,11 +8,11 @@ from dora_systemd.decisions.cell.rights import (
     NodeRights,
     check_rights_nodes,
     described,
+    essential_nodes,
     format_commands,
     format_node_rights,
     given_rights,
     has_process_rights,
-    is_essential,
     limits_of_others,
     merge_node_rights,
     parse_node_rights,
@@ -25,6 +25,7 @@ from dora_systemd.decisions.settings.resolve import resolve_settings, with_setti
 from dora_systemd.decisions.unit.properties import rights_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from tests.unit.fakes.dialogue import OPTIONS
+from tests.unit.fakes.manager import with_rights
 from tests.unit.fakes.rights_values import rights_of_a_node
 
 
@@ -105,7 +106,7 @@ def test_merging_keeps_what_is_not_given_again() -> None:
 
 def test_questions() -> None:
     rights = [parse_node_rights("a:essential"), parse_node_rights("b:essential=no")]
-    assert [is_essential(rights, node) for node in "abc"] == [True, False, False]
+    assert essential_nodes(with_rights(OPTIONS, *rights)) == ("a",)
     assert not has_process_rights(rights)
     assert has_process_rights([parse_node_rights("a:nice=0")])
     assert [parse_node_rights(f"a:scheduling={s}").priority for s in ("rr:3", "idle")] == [3, 0]
