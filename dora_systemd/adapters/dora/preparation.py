@@ -37,13 +37,16 @@ class Prepared:
     descriptor: Mapping[str, Any]  # what dora gets
 
 
-def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
+def prepare(
+    options: RunnerOptions, environment: Mapping[str, str], is_reload: bool = False
+) -> Prepared:
     """Read and rewrite the dataflow of `options`. environment: that of the nodes.
 
-    Raises DoraSystemdError if it is not readable or a node of it cannot run.
+    is_reload: as of check_settings(). Raises DoraSystemdError if it is not readable or a node of it
+    cannot run.
     """
     dataflow = load_dataflow(options)
-    check_named_nodes(options, dataflow)
+    check_named_nodes(options, dataflow, is_reload)
     if options.machine:
         from dora_systemd.decisions.machines.part import own_dataflow
 
@@ -69,15 +72,15 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
 
 
-def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
+def check_named_nodes(options: RunnerOptions, dataflow: Dataflow, is_reload: bool = False) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a node that does not exist, or cannot have a setting.
 
-    dataflow: with modules expanded.
+    dataflow: with modules expanded. is_reload: as of check_settings().
     """
     if options.settings:
         from dora_systemd.decisions.settings.runner import check_settings
 
-        check_settings(options, dataflow.nodes)
+        check_settings(options, dataflow.nodes, is_reload)
 
 
 def resolved(options: RunnerOptions) -> RunnerOptions:

@@ -8,6 +8,7 @@ RUNNER_SETTINGS there, and a line in MODULES of cell/options.py. A new concern i
 table.py. The runner receives the setting as `--set=[NODE:]KEY=TEXT`, with the text of Kind.format,
 and reads it with `options.of_node(node, KEY)`, `by_node(KEY)` or `of_dataflow(KEY)`. Each machine
 of a dataflow gets the settings of its nodes. The names of nodes are checked; the `check` of a
-setting can refuse more. Each time the dataflow is read, all this is checked again. Only the policy
-of restarts is read without its module, because the runner needs it before anything else.
+setting can refuse more. Each time the dataflow is read, all this is checked again; a hot reload may
+remove a node with a setting that `outlives_node`. Only the policy of restarts is read without its
+module, because the runner needs it before anything else.
 """

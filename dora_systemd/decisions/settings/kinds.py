@@ -74,6 +74,8 @@ class Setting(Generic[T]):
     # obey it for their own nodes
     on_head: bool = False
     on_members: bool = True
+    # a hot reload may remove a node with a value; a limit could be for a node that was renamed
+    outlives_node: bool = False
     # for a value for the dataflow that names nodes: what the runner gets instead, by node, "" for
     # the dataflow, and by key. From the values that files give nodes, and the one for the dataflow.
     by_node: Callable[[Mapping[str, Any], Any], Mapping[str, Mapping[str, Any]]] | None = None

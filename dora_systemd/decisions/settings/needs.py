@@ -41,6 +41,7 @@ NEEDS = Setting[tuple[str, ...]](
     "NODE=net:INTERFACE.",
     per_node=True,
     raises=lambda needs: any(one.startswith(FOREIGN) for one in needs),
+    outlives_node=True,
     by_node=_by_node,
     check=_check,
 )

@@ -121,6 +121,7 @@ WATCHDOG = Setting[Watchdogs](
     "Time in which all nodes, or NODE, must send WATCHDOG=1; one that does not is ended.",
     variable="DORA_WATCHDOG",
     per_node=True,
+    outlives_node=True,
     by_node=by_named_node("watchdog", format_watchdogs, HINT),
     check=check_sockets,
 )
@@ -130,6 +131,7 @@ NOTIFY = Setting[bool](
     False,
     "Give the nodes a notify socket, to report their STATUS=.",
     per_node=True,
+    outlives_node=True,
     check=check_sockets,
 )
 SIGN_SETTINGS: tuple[Setting[Any], ...] = (WATCHDOG, NOTIFY)

@@ -33,6 +33,7 @@ WATCH = Setting[tuple[str, ...]](
     variable="DORA_WATCH",
     per_node=True,
     on_members=False,
+    outlives_node=True,
     at_start=relative_patterns,
 )
 IGNORE = Setting[tuple[str, ...]](
@@ -50,6 +51,7 @@ REPLACE = Setting[str](
     "A reloaded node stops before its replacement starts (stop-first) or after (start-first).",
     per_node=True,
     on_members=False,
+    outlives_node=True,
 )
 
 RELOAD_SETTINGS: tuple[Setting[Any], ...] = (HOT_RELOAD, WATCH, IGNORE, REPLACE)

@@ -151,7 +151,7 @@ class Sources:
     def prepare(self) -> Prepared:
         """Read the dataflow again, as at a start. Raises DoraSystemdError."""
         options = self._options
-        prepared = prepare(options, self._environment)
+        prepared = prepare(options, self._environment, is_reload=True)
         if reason := refusal_of_dora(options, self._environment):
             message = f"cannot use {options.dataflow}: {reason}"
             raise DoraSystemdError(message, "", ExitCode.BAD_INPUT)

@@ -100,6 +100,16 @@ def test_nodes_have_to_exist() -> None:
     check_settings(started(), NODES)
 
 
+def test_a_hot_reload_may_remove_a_node_with_settings() -> None:
+    """But a limit could be for a node that was renamed."""
+    options = started({"nodes": {"arm": {"watch": "*.py", "watchdog": "5s"}}})
+    check_settings(options, NODES[:1], is_reload=True)
+    with pytest.raises(DoraSystemdError, match="of the node 'arm'"):
+        check_settings(options, NODES[:1])
+    with pytest.raises(DoraSystemdError, match="cannot set nice of the node 'arm'"):
+        check_settings(started({"nodes": {"arm": {"nice": 5}}}), NODES[:1], is_reload=True)
+
+
 def test_a_concern_refuses_more() -> None:
     with pytest.raises(DoraSystemdError, match="that is a circle"):
         check_settings(started({"nodes": {"arm": {"stop": {"after": ["arm"]}}}}), NODES)
