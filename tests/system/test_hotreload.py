@@ -132,6 +132,7 @@ def test_a_shared_module_restarts_those_that_import_it(cell: Cell, project: Proj
 
 def test_the_dataflow_file_node_by_node(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
+    project.write("dataflow.systemd.yml", "nodes: {sink: {watch: '*.txt', needs: /dev/null}}")
     cell.start(flow, HOT)
     before = pids(cell)
     save(flow, THREE_NODES.replace("path: sink.py", "path: sink.py\n    env: {COLOR: red}"))
@@ -164,6 +165,8 @@ def test_the_dataflow_file_node_by_node(cell: Cell, project: Project) -> None:
     assert {node: pids(cell)[node] for node in ("source", "doubler")} == {
         node: before[node] for node in ("source", "doubler")
     }
+    save(flow, THREE_NODES.partition("  - id: sink")[0])
+    wait_for("it goes, whatever its settings are", lambda: "sink" not in cell.status.nodes)
 
 
 def test_what_dora_cannot_change_restarts_the_dataflow_in_its_unit(
