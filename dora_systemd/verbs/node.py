@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.dora.command import coordinator_variables, parse_node_command
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.decisions.dora.protocol import Params, Reply
+from dora_systemd.decisions.life.stop_budget import answer_timeout
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean
 from dora_systemd.paths import CellPaths
@@ -20,7 +22,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_environment
 from dora_systemd.trust.sockets import require_listener
 from dora_systemd.trust.terminals import run_apart
-from dora_systemd.values import quoted
+from dora_systemd.values import SECOND, quoted
 from dora_systemd.verbs.facts.cells import CONTROL, Cell, refuse_parts
 from dora_systemd.verbs.facts.locks import IfInhibited, Tell, require_uninhibited
 from dora_systemd.verbs.facts.reading import read_status
@@ -74,6 +76,12 @@ def require_running(cell: Cell) -> None:
         )
 
 
+def patient(cell: Cell) -> Ask:
+    """What sends a request to the runner of `cell`, and waits as long as nodes may take to stop."""
+    options = cell.options if cell.has_options else None
+    return partial(order, most=answer_timeout(options) / SECOND) if options else order
+
+
 def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
     """Send one request to the cell's coordinator; the reply. Raises DoraSystemdError."""
     # Imported late: WebSockets are slow to import, and no other verb needs them.
@@ -96,7 +104,7 @@ def order_node(
     scope: Scope,
     cell: Cell,
     given: NodeOrder,
-    ask: Ask = order,
+    ask: Ask | None = None,
     how: IfInhibited = IfInhibited.REFUSE,
     tell: Tell | None = None,
 ) -> str:
@@ -111,7 +119,7 @@ def order_node(
     require_uninhibited(scope, [cell], f"{given.what} node {given.node} of", how, tell)
     by = f"{caller(os.getuid(), os.environ)} ({given.by})"
     request = {"what": given.what, "node": given.node, "by": by, "grace": given.grace}
-    path = socket_of(scope, cell)
+    path, ask = socket_of(scope, cell), ask or patient(cell)
     try:
         return "; ".join(done_of(path, ask(path, {"verb": "node", **request})))
     except DoraSystemdError as error:
@@ -119,7 +127,9 @@ def order_node(
         raise DoraSystemdError(error.message, hint, error.code) from error
 
 
-def order_like_dora(scope: Scope, cell: Cell, arguments: Sequence[str], ask: Ask = order) -> str:
+def order_like_dora(
+    scope: Scope, cell: Cell, arguments: Sequence[str], ask: Ask | None = None
+) -> str:
     """Have the runner do what is a `dora node restart` or `stop`; what dora would print.
 
     "" for another command, and for one about another dataflow: they are dora's. Raises

@@ -26,12 +26,12 @@ from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.values import format_bool
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
-from dora_systemd.verbs.node import require_node, require_running, socket_of
+from dora_systemd.verbs.node import patient, require_node, require_running, socket_of
 
 Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
 
-def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) -> list[str]:
+def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask | None = None) -> list[str]:
     """Have the runner reload; what was done. Empty if no file has changed and no node is named.
 
     Raises DoraSystemdError; then the old version keeps running.
@@ -41,7 +41,7 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) ->
     _refuse_release(cell)
     if node is not None:
         require_node(scope, cell, node)
-    path = socket_of(scope, cell)
+    path, ask = socket_of(scope, cell), ask or patient(cell)
     return done_of(path, ask(path, {"verb": "reload", "node": node}))
 
 

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
+from tests.system import recorders
 from tests.system.cells import TICK, Cell, Project, journalctl, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
@@ -79,6 +80,16 @@ def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
     assert shown == [one["node"] for one in listed] == ["source", "doubler", "sink"]
     assert browser.js(LAST.replace("LINES", json.dumps(["a"]))) == "The last line of cam"
     assert browser.js(LAST.replace("LINES", json.dumps(["a", "b"]))) == "The last 2 lines of cam"
+    assert browser.failures() == []
+
+
+def test_how_long_a_node_has_to_stop(browser: Browser, cell: Cell, project: Project) -> None:
+    recorders.start(cell, recorders.flow(project, seconds=5))
+    browser.wait_text(f"{node('recorder')} .badge", "Running")
+    cell.systemctl("stop", "--no-block")
+    browser.wait_text(f"{node('recorder')} .sign", " s left to stop")
+    browser.wait_text(f"{node('recorder')} .said", "writing episode")
+    wait_for("it is gone", lambda: cell.is_gone)
     assert browser.failures() == []
 
 

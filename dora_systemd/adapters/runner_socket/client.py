@@ -27,7 +27,8 @@ from dora_systemd.values import as_mapping, quoted
 Request = Mapping[str, Any]
 MAX_BYTES = 1 << 16
 ANSWER_SECONDS = 150.0
-"""A reload may have to wait for a grace duration, and for nodes to be ready."""
+"""A reload may have to wait for a grace duration, and for nodes to be ready; its caller knows how
+long nodes may take to stop."""
 RELAY_SECONDS = 4.0
 
 
@@ -37,16 +38,19 @@ def ask(path: Path, request: Request, seconds: float = ANSWER_SECONDS) -> dict[s
         return _exchange(stream, path, request, seconds)
 
 
-def order(path: Path, request: Request, seconds: float = RELAY_SECONDS) -> dict[str, Any]:
-    """Send a request that may take long, to a runner that responds now. Raises DoraSystemdError.
+def order(
+    path: Path, request: Request, seconds: float = RELAY_SECONDS, most: float = ANSWER_SECONDS
+) -> dict[str, Any]:
+    """Send a request that may take `most` seconds, to a runner that responds now.
 
-    A runner that is stopped, or does not answer on purpose, fails after `seconds`.
+    A runner that is stopped, or does not answer on purpose, fails after `seconds`. Raises
+    DoraSystemdError.
     """
     # A refusal counts as a response: a reload does not need a coordinator.
     refused = contextlib.suppress(DoraSystemdError)
     with _reaching(path), connect_unix(path, seconds) as stream, refused:
         _exchange(stream, path, {"verb": "coordinator"}, seconds)
-    return ask(path, request)
+    return ask(path, request, most)
 
 
 def ask_refusal(path: Path) -> DoraSystemdError | None:

@@ -18,6 +18,11 @@ ANSWER_MARGIN = 2 * SECOND
 RESERVE = SECOND
 """The runner exits this long before systemd kills it, because systemd's timer started first."""
 LEAVE_TIMEOUT = 2 * SECOND
+ANSWER_TIMEOUT = 150 * SECOND
+"""For the answer of a runner that may stop nodes and wait until others are ready; the time in which
+the nodes stop is added."""
+_LONGEST = 24 * 3600 * SECOND
+"""A grace duration can be infinite, but nobody waits longer for an answer."""
 
 
 def kill_delay(grace: int) -> int:
@@ -36,6 +41,11 @@ def nodes_timeout(options: RunnerOptions) -> int:
         limit: int = options.of_dataflow("stop_limit")
         return limit
     return kill_delay(options.grace)
+
+
+def answer_timeout(options: RunnerOptions) -> int:
+    """Timeout for the answer to a reload, restart or stop of nodes."""
+    return ANSWER_TIMEOUT + min(nodes_timeout(options), _LONGEST)
 
 
 def unit_timeout(options: RunnerOptions) -> int:

@@ -14,6 +14,11 @@ function signWords({ watchdog_us: limit, watchdog_age_us: age }) {
   return `watchdog ${age === null ? "-" : seconds(age)} of ${seconds(limit)} s`;
 }
 
+/** How long the node has to stop. */
+function stopWords({ stop_left_us: left }) {
+  return typeof left === "number" ? `${Math.round(left / 1e6)} s left to stop` : "";
+}
+
 export class NodeRow {
   /** ask: is called with an action and the node. choose: with the node whose logs are wanted. */
   constructor(name, ask, choose) {
@@ -51,7 +56,7 @@ export class NodeRow {
     say(this.machine, facts.machine ? `on ${facts.machine}` : "");
     const rights = [facts.essential ? "essential" : "", facts.scheduling];
     say(this.rights, rights.filter(Boolean).join(" "));
-    say(this.sign, isAlive ? signWords(facts) : "");
+    say(this.sign, stopWords(facts) || (isAlive ? signWords(facts) : ""));
     const ended = at ? since(at) : "";
     say(this.up, isAlive ? `up ${uptime(at ? Date.now() * 1000 - at : null)}` : ended);
     say(this.restarts, restarts ? plural(restarts, "restart") : "");

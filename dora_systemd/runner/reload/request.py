@@ -7,9 +7,12 @@ import os
 import sys
 from pathlib import Path
 
-from dora_systemd.adapters.runner_socket.client import ask, done_of
+from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths, own_directory
+
+MOST_SECONDS = 24 * 3600.0
+"""A bound for the answer; TimeoutStartSec= of the unit bounds this command, too."""
 
 
 def main() -> int:
@@ -20,7 +23,7 @@ def main() -> int:
             hint = "systemd runs this: use `doractl reload`"
             raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
         path = CellPaths(Path(directory)).socket
-        done = done_of(path, ask(path, {"verb": "reload"}))
+        done = done_of(path, order(path, {"verb": "reload"}, most=MOST_SECONDS))
     except DoraSystemdError as error:
         print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
         return error.code

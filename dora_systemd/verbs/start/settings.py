@@ -6,13 +6,15 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, find_line
 from dora_systemd.decisions.cell.rights import BY_KEY
+from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
-from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
+from dora_systemd.decisions.settings.stops import STOP_LIMIT
+from dora_systemd.decisions.settings.table import ENV_FILE, GRACE_DURATION, SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import hint_of_changeable
-from dora_systemd.values import as_mapping, shown
+from dora_systemd.values import INFINITY, as_mapping, format_duration, shown
 from dora_systemd.verbs.start.read import (
     SYSTEM_FILE,
     Files,
@@ -35,6 +37,8 @@ def settings_of(scope: Scope, files: Files, request: StartRequest) -> Settings:
     for one in others:
         require_modest(one)
     settings = _resolved(found, flags, environment)
+    for one in others:
+        _check_grace(settings, one)
     if not any(ENV_FILE.name in as_mapping(one.document) for one in others):
         return settings
     roots = _resolved([one for one in found if one not in others], flags, environment)
@@ -104,6 +108,24 @@ def _check_trust(read: SettingsFile) -> None:
     dangerous = [only[key] for key in as_mapping(read.document) if key in only]
     if dangerous:
         raise _untrusted(read, dangerous[0].name, dangerous[0].flags[0])
+
+
+def _check_grace(settings: Settings, read: SettingsFile) -> None:
+    """Refuse a grace duration of another user's file with which a stop exceeds stop_limit.
+
+    A shutdown of the machine waits for the stop.
+    """
+    time, limit = kill_delay(settings[GRACE_DURATION]), settings[STOP_LIMIT]
+    if settings.source(GRACE_DURATION) != str(read.path) or time <= limit:
+        return
+    grace = format_duration(settings[GRACE_DURATION])
+    message = (
+        f"cannot use grace_duration {grace} in {shown(str(read.path))}: nodes would be killed"
+        f" {'never' if time >= INFINITY else f'after {format_duration(time)}'},"
+        f" and stop_limit is {format_duration(limit)}"
+    )
+    hint = f"lower it, or root raises {STOP_LIMIT.flags[0]} or stop_limit in {SYSTEM_FILE}"
+    raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 
 
 def _untrusted(read: SettingsFile, key: str, flag: str) -> DoraSystemdError:

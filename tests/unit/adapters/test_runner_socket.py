@@ -43,6 +43,8 @@ REFUSAL = DoraSystemdError("cannot use \33[1mrobot.yml", "mend it", ExitCode.BAD
 async def answer(request: Mapping[str, Any]) -> dict[str, Any]:
     if request.get("verb") == "check":
         return refused_reply(REFUSAL)
+    if request.get("verb") == "slow":
+        await asyncio.sleep(0.3)
     if request.get("verb") == "broken":
         raise KeyError("node")
     if request.get("verb") == "no":
@@ -121,6 +123,14 @@ def test_an_order_for_a_runner_that_is_silent(tmp_path: Path) -> None:
         with pytest.raises(DoraSystemdError, match="timed out") as caught:
             order(path, {"verb": "reload"}, 0.05)
     assert caught.value.code == ExitCode.NOT_RUNNING
+
+
+def test_an_order_takes_as_long_as_its_caller_says(tmp_path: Path) -> None:
+    with runner(path := tmp_path / "runner.sock", None):
+        with pytest.raises(DoraSystemdError, match="timed out"):
+            order(path, {"verb": "slow"}, most=0.01)
+        # By its end the first one has ended, too.
+        assert order(path, {"verb": "slow"}, most=30) == {"done": ["slow"]}
 
 
 def test_a_runner_whose_dataflow_could_not_start_again(tmp_path: Path) -> None:

@@ -5,11 +5,13 @@ import socket
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.cell.options import SettingText
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -69,6 +71,17 @@ def test_who_asks_for_what(scope: Scope, cell: Cell) -> None:
     by = request.pop("by") if isinstance(request, dict) else ""
     assert by.endswith(" (doractl node stop)")
     assert request == {"verb": "node", "what": "stop", "node": "camera", "grace": 5}
+
+
+def test_how_long_an_answer_may_take() -> None:
+    """As long as the stop of a recorder, and longer."""
+    manager = FakeManager()
+    manager.add(options())
+    usual = options()._replace(name="slow")
+    manager.add(usual._replace(settings=(SettingText("recorder", "stop", "within=200s"),)))
+    found = [node.patient(cell) for cell in read_cells(manager)]
+    waits = [one.keywords["most"] for one in found if isinstance(one, partial)]
+    assert waits == [165, 450]
 
 
 def test_dora_node_stop(scope: Scope, cell: Cell) -> None:

@@ -331,6 +331,30 @@ def test_rights_that_only_root_gives(project: Path, text: str) -> None:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+def test_a_grace_duration_of_others_is_within_stop_limit(project: Path) -> None:
+    flow, beside = project / "robot.yml", project / "robot.systemd.yml"
+    beside.write_text("grace_duration: 201s")
+    settings(SYSTEM, flow)
+    os.chown(beside, 65534, 65534)
+    settings(USER, flow)
+    settings(SYSTEM, flow, {"stop_limit": "6min"})
+    settings(SYSTEM, flow, {"grace_duration": "1h"})
+    with pytest.raises(DoraSystemdError) as caught:
+        settings(SYSTEM, flow)
+    assert caught.value.message == (
+        f"cannot use grace_duration 3min 21s in {beside}: nodes would be killed after 5min 1s 500ms,"
+        " and stop_limit is 5min"
+    )
+    assert "--stop-limit" in caught.value.hint
+    assert caught.value.code is ExitCode.BAD_INPUT
+    beside.write_text("grace_duration: infinity")
+    with pytest.raises(DoraSystemdError, match="would be killed never"):
+        settings(SYSTEM, flow)
+    beside.write_text("grace_duration: 200s")
+    settings(SYSTEM, flow)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
 def test_environment_files_of_others_are_lent(project: Path) -> None:
     flow, beside = project / "robot.yml", project / "robot.systemd.yml"
     beside.write_text("env_file: [/a, /b]\n")
