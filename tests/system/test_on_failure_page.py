@@ -1,6 +1,7 @@
 """The scripts of docs/on-failure.md, as they are there, against servers on this machine."""
 
 import json
+import os
 import re
 import socket
 import socketserver
@@ -13,6 +14,7 @@ import pytest
 
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.test_on_failure import FAILS, FLOW, SINK, SOURCE
+from tests.system.typed import Shell, by_kind, replay
 
 # The units of notices are installed below /usr/local.
 pytestmark = pytest.mark.lab
@@ -91,6 +93,15 @@ def _units() -> Iterator[None]:
 
 
 @pytest.fixture
+def named(project: Project) -> Iterator[Cell]:
+    """The dataflow of the page."""
+    del project  # it outlives the dataflow
+    cell = Cell("night")
+    yield cell
+    cell.end()
+
+
+@pytest.fixture
 def web() -> Iterator[Requests]:
     with Requests() as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -146,6 +157,48 @@ def test_ntfy(cell: Cell, project: Project, web: Requests) -> None:
     ((fields, body),) = wait_for("the request", lambda: web.got)
     assert fields["Title"].startswith(f"{cell.name} on ")
     assert "source stays down" in body
+
+
+NIGHT = """
+nodes:
+  - {id: camera, path: camera.py, inputs: {tick: dora/timer/millis/20}}
+  - {id: driver, path: driver.py, inputs: {tick: dora/timer/millis/20}}
+  - {id: arm, path: sink.py, inputs: {tick: dora/timer/secs/1}}
+"""
+
+
+def night() -> tuple[str, str, str]:
+    """The settings, what the telephone shows, and what is typed in the morning."""
+    text = PAGE.read_text().partition("## A night\n")[2].partition("\n## ")[0]
+    settings, titles, typed = re.findall(r"^```\w*\n(.*?)^```$", text, re.M | re.S)
+    host = os.uname().nodename
+    return settings, titles.replace("arm-3", host), typed.replace("arm-3", host)
+
+
+def test_a_night(named: Cell, project: Project, web: Requests) -> None:
+    """The story of the page, with the settings that are there."""
+    settings, titles, typed = night()
+    for node, status in (("camera", 7), ("driver", 3)):
+        text = SOURCE.replace('"crash"', f'"{node}.broken"').replace("exit(7)", f"exit({status})")
+        project.write(f"{node}.py", text)
+    project.write("sink.py", SINK)
+    project.write("ntfy.sh", SCRIPTS["ntfy.sh"]).chmod(0o755)
+    url = f"http://127.0.0.1:{port_of(web)}/robots"
+    project.write("night.systemd.yml", f"{settings}env: {{NTFY_URL: '{url}'}}\n")
+    named.start(project.write("night.yml", NIGHT))
+    project.write("camera.broken", "")
+    wait_for("the first message", lambda: web.got)
+    project.write("driver.broken", "")
+    wait_for("some restarts", lambda: int(named.show("NRestarts")) >= 3)
+    for node in ("camera", "driver"):
+        (project.root / f"{node}.broken").unlink()
+    wait_for("the second message", lambda: len(web.got) > 1, 60)
+    shown = "".join(f"{fields['Title']}\n" for fields, _ in web.got[:2])
+    assert by_kind(shown) == by_kind(titles)
+    shell = Shell(["env", "SYSTEMD_PAGER=cat"], project.root)
+    wrong = replay(shell, typed)
+    shell.end()
+    assert not wrong, "".join(wrong)
 
 
 @pytest.mark.warns(*FAILS)

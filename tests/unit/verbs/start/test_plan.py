@@ -342,8 +342,8 @@ def test_a_grace_duration_of_others_is_within_stop_limit(project: Path) -> None:
     with pytest.raises(DoraSystemdError) as caught:
         settings(SYSTEM, flow)
     assert caught.value.message == (
-        f"cannot use grace_duration 3min 21s in {beside}: nodes would be killed after 5min 1s 500ms,"
-        " and stop_limit is 5min"
+        f"cannot use grace_duration 3min 21s in {beside}: nodes would be killed after"
+        " 5min 1s 500ms, and stop_limit is 5min"
     )
     assert "--stop-limit" in caught.value.hint
     assert caught.value.code is ExitCode.BAD_INPUT
