@@ -23,16 +23,15 @@ from dora_systemd.adapters.host import fd_store, notify
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import serve
-from dora_systemd.decisions.cell.environment import with_changes
 from dora_systemd.decisions.cell.launch import kinds, watchdogs_of
 from dora_systemd.decisions.cell.limits import limits_of
 from dora_systemd.decisions.cell.line_rates import rates_of
-from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.stops import named_stops
 from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
+from dora_systemd.decisions.life.refusal import refusal_exit
 from dora_systemd.decisions.life.states import Cell, RunnerExit
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.decisions.logs.lines import Origin
@@ -51,6 +50,7 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside, say, words
 from dora_systemd.runner.cell.machine_role import Alone
 from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.cell.refusal import read_options, tell_failure
 from dora_systemd.runner.cell.restarts import (
     Life,
     begin_life,
@@ -118,12 +118,6 @@ async def run_cell(
     finally:
         pipes.close(clock.left(JOURNAL_SECONDS if clock.by else CLOSE_SECONDS))
         journal.wait_read(clock.left(JOURNAL_SECONDS))
-
-
-def tell_failure(pipes: LogPipes, error: DoraSystemdError, cause: Cause) -> None:
-    """Record why there is no run of the dataflow, and show it in STATUS=."""
-    pipes.write_event("dataflow-failed", reason=error.message, cause=cause)
-    notify.send_status(format_refusal(error))
 
 
 class Runs:
@@ -377,7 +371,7 @@ def run_loop(cell: Coroutine[Any, Any, RunnerExit]) -> RunnerExit:
 def run(argv: list[str], begun: Begun | None) -> int:
     """Run the cell that `argv` describes; the exit status. begun: see run_cell."""
     try:
-        options = with_changes(parse_runner_argv(argv), os.environ)
+        options = read_options(argv)
         directory = own_directory(os.environ)
         if not directory:
             hint = "it is started by systemd: use `doractl start`"

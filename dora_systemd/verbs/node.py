@@ -11,6 +11,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import caller
 from dora_systemd.adapters.runner_socket import client as runner_socket
 from dora_systemd.adapters.runner_socket.client import done_of, order
+from dora_systemd.decisions.cell.status import PROTOCOL
 from dora_systemd.decisions.dora.command import coordinator_variables, parse_node_command
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.decisions.dora.protocol import Params, Reply
@@ -188,7 +189,18 @@ def _unit_facts(manager: Manager, cell: Cell) -> tuple[int, bool]:
 
 
 def socket_of(scope: Scope, cell: Cell) -> Path:
-    """The socket of the runner of a dataflow."""
+    """The socket of the runner of a dataflow.
+
+    Raises DoraSystemdError for a runner whose answers this version does not know.
+    """
+    protocol = read_status(scope, cell).protocol
+    if protocol != PROTOCOL:
+        reason = f"it has protocol {protocol}, and this doractl has protocol {PROTOCOL}"
+        raise DoraSystemdError(
+            f"cannot send a request to the runner of {cell.name}: {reason}",
+            f"doractl restart {cell.name} starts the installed version",
+            ExitCode.USAGE,
+        )
     return CellPaths(scope.cell_directory(cell.name)).socket
 
 

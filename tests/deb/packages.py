@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -39,8 +39,11 @@ def find_packages() -> list[Path]:
     return found
 
 
-def build_previous(place: Path) -> list[Path]:
-    """The same packages as an earlier build would be, below `place`."""
+def build_previous(place: Path, edits: Mapping[str, tuple[str, str]] = {}) -> list[Path]:
+    """The same packages as an earlier build would be, below `place`.
+
+    edits: a text and another one for it, by module of the product.
+    """
     built = place / "previous"
     built.mkdir()
     for path in find_packages():
@@ -52,6 +55,10 @@ def build_previous(place: Path) -> list[Path]:
         for module in tree.glob("usr/lib/python3/dist-packages/dora_systemd/__init__.py"):
             code = module.read_text()
             module.write_text(re.sub(r'(__version__ = "[^"]+)', r"\1~previous", code))
+        for name, (text, other) in edits.items():
+            for module in tree.glob(f"usr/lib/python3/dist-packages/dora_systemd/{name}"):
+                assert text in module.read_text()
+                module.write_text(module.read_text().replace(text, other))
         run("dpkg-deb", "--root-owner-group", "-Znone", "--build", str(tree), str(built))
     return sorted(built.iterdir())
 

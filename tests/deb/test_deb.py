@@ -4,13 +4,16 @@ Needs what `make deb` makes, in dist/, or the packages themselves with autopkgte
 """
 
 import json
+import os
 import pwd
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from dora_systemd.errors import ExitCode
 from tests.deb import packages
 from tests.deb.packages import sh
 from tests.system.cells import dora_processes, wait_for
@@ -82,6 +85,7 @@ def last_words(user: str) -> str:
 
 
 RESTART = "doractl restart robot"
+ON_FAILURE = "--restart-policy on-failure"
 
 
 def running_version(user: str) -> str:
@@ -226,6 +230,37 @@ def test_upgrade_keeps_dataflows_running(tmp_path: Path, flows: dict[str, Path])
     sh("doractl restart robot && doractl disable robot")
     assert running_version("root") == ""
     sh("doractl disable released && doractl stop released", "alice")
+
+
+OTHER = {"decisions/cell/options.py": ('"grace-duration"', '"grace-time"')}
+"""A version whose command line of a runner this one does not know, and the reverse."""
+
+
+def refused_restart(user: str) -> str:
+    done = sh("doractl restart robot", user, check=False)
+    assert done.returncode == ExitCode.BAD_INPUT
+    assert "robot keeps running" in done.stderr
+    return running_version(user)
+
+
+def test_an_upgrade_that_changes_the_command_line(tmp_path: Path, flows: dict[str, Path]) -> None:
+    """All verbs that do not start it work; after a crash `why` says what starts it again."""
+    packages.install(packages.build_previous(tmp_path, OTHER))
+    for user, flow in flows.items():
+        assert "another version has started it" in refused_restart(user)
+        sh(f"doractl stop robot && doractl start {flow} --name robot {ON_FAILURE}", user)
+    packages.install()
+    for user in USERS:
+        assert "unknown argument '--grace-time=10s'" in refused_restart(user)
+        sh("doractl node restart robot detector && doractl logs robot", user)
+        os.kill(int(main_pid(user, "robot")), signal.SIGKILL)
+        wait_for("its end", lambda: "Failed" in sh("doractl list --all", user).stdout)  # noqa: B023
+        why = sh("doractl why robot", user, check=False).stdout
+        assert "cannot read the runner's command line: unknown argument '--grace-time=10s'" in why
+        todo = re.search(r"run: (doractl start --name robot \S+),", why)
+        assert todo, why
+        sh(todo[1], user)
+        assert running_version(user) == ""
 
 
 def test_stop_and_start_after_that(flows: dict[str, Path]) -> None:

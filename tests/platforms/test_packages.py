@@ -211,6 +211,28 @@ def test_a_system_account_is_told_how_to_get_a_manager(flow: Path) -> None:
     run("loginctl", "disable-linger", "games")
 
 
+TELL = """#!/bin/sh
+env | grep ^DORA_NOTICE_ >"$OUT/new"
+mv "$OUT/new" "$OUT/notice"
+"""
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_a_notice_of_a_failure(user: str, flow: Path) -> None:
+    """systemd 252 and 262 start the unit that sends it, and copy the sandbox of the nodes."""
+    tell = Project(flow.parent, is_new=False).write("tell.sh", TELL)
+    tell.chmod(0o755)
+    (place := flow.parent / "out").mkdir()
+    place.chmod(0o777)
+    start(user, flow, f"--on-failure={tell}", f"--writable={place}", f"--env=OUT={place}")
+    listed = json.loads(doractl(user, "list", "robot", "-o", "json").stdout)
+    (pid,) = [one["pid"] for one in listed["nodes"] if one["node"] == "sink"]
+    run("kill", "-KILL", str(pid))
+    text = wait_for("the notice", lambda: (place / "notice").exists() and (place / "notice"))
+    assert "DORA_NOTICE_EVENT=node-given-up\n" in text.read_text()
+    assert "DORA_NOTICE_NODE=sink\n" in text.read_text()
+
+
 @pytest.mark.parametrize("user", USERS)
 def test_a_killed_daemon_is_followed_by_a_new_start(user: str, flow: Path) -> None:
     start(user, flow, "--restart-policy", "on-failure")

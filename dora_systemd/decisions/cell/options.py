@@ -337,8 +337,15 @@ def known_options_from_command(command: Sequence[str]) -> RunnerOptions:
     What is optional and unknown, or has a value that this version does not know, is left out.
     Raises DoraSystemdError for a command that is no runner's.
     """
-    arguments = _arguments(command)
-    return parse_runner_argv([*filter(_is_known, arguments[:-1]), *arguments[-1:]])
+    return known_options(_arguments(command))
+
+
+def known_options(argv: Sequence[str]) -> RunnerOptions:
+    """The options that this version knows, of a runner that another version has started.
+
+    Raises DoraSystemdError as known_options_from_command().
+    """
+    return parse_runner_argv([*filter(_is_known, argv[:-1]), *argv[-1:]])
 
 
 def _is_known(argument: str) -> bool:

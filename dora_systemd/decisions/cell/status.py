@@ -93,6 +93,13 @@ class NodeStatus(NamedTuple):
         return self.state in ALIVE_NODE_STATES
 
 
+PROTOCOL = 1
+"""Of the requests to a runner and its answers. It changes when a runner would carry out a request
+of another version in another way; a request that is only new has its own error."""
+_FIRST_PROTOCOL = 1
+"""Of tables without one."""
+
+
 class CellStatus(NamedTuple):
     """The content of status.json."""
 
@@ -115,6 +122,7 @@ class CellStatus(NamedTuple):
     # of nodes on other machines, for parse_use() of dora_systemd.decisions.machines.usage
     usage: Mapping[str, Sequence[Any]] = {}
     version: str = __version__  # of the dora-systemd that wrote it, or "" of a version before
+    protocol: int = PROTOCOL  # of its runner
 
     @property
     def alive_count(self) -> int:
@@ -191,6 +199,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         stop_dues=_by_node(known.get("stop_dues", {}), lambda one: _numbers([one], 1)[0]),
         usage=_by_node(known.get("usage", {}), tuple),
         version=_version(known),
+        protocol=_number({"protocol": _FIRST_PROTOCOL, **known}, "protocol"),
     )
 
 

@@ -17,6 +17,7 @@ class Cause(StrEnum):
     START_TIMEOUT = "start-timeout"
     REFUSED = "refused"
     BAD_DATAFLOW = "bad-dataflow"
+    OTHER_VERSION = "other-version"
     DAEMON_LOST = "daemon-lost"
     COORDINATOR_LOST = "coordinator-lost"
     NO_ANSWER = "no-answer"

@@ -78,7 +78,7 @@ PRESSURE = Family(
 STATE = Family("state", "1 for the current state, 0 for all others.")
 RESTARTS = Family("restarts_total", "Automatic restarts; those that somebody asked for are none.")
 READY = Family("ready_time_seconds", "When all nodes were ready, in Unix time.")
-INFO = Family("info", "UUID, unit and release of a dataflow; the value is always 1.")
+INFO = Family("info", "UUID, unit, release and version of dora-systemd; the value is always 1.")
 RIGHTS = Family("info", "What it is, its scheduling and CPUs; the value is always 1.")
 FACT_FAMILIES = [(one, Family(one.metric, one.help)) for one in NODE_FACTS if one.metric]
 NODES = Family("nodes", "Nodes that the dataflow has.")
@@ -117,7 +117,8 @@ def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, li
 
 def _identity(row: DataflowRow) -> Labels:
     release = {"release": row.release} if row.release else {}
-    return {"uuid": row.uuid, "unit": row.unit, **release}
+    version = {"version": row.runner_version} if row.runner_version else {}
+    return {"uuid": row.uuid, "unit": row.unit, **release, **version}
 
 
 def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[Sample]]]:

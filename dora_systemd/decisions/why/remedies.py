@@ -26,6 +26,8 @@ _REMEDIES = {
     Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",
     Cause.REFUSED: "fix {file}, then run: doractl restart {name}",
     Cause.BAD_DATAFLOW: "fix {file}, then run: doractl restart {name}",
+    Cause.OTHER_VERSION: "another version of dora-systemd has started it; run: "
+    "doractl start --name {name} {file}, or deploy its project again",
     Cause.DAEMON_LOST: _AUTOMATIC,
     Cause.COORDINATOR_LOST: _AUTOMATIC,
     Cause.NO_ANSWER: _OVERLOADED,

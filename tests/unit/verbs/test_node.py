@@ -84,6 +84,17 @@ def test_how_long_an_answer_may_take() -> None:
     assert waits == [165, 450]
 
 
+def test_a_runner_with_another_protocol(scope: Scope, cell: Cell) -> None:
+    table = scope.cell_directory("robot") / "status.json"
+    status = CellStatus.from_json(table.read_text())
+    table.write_text(status._replace(protocol=2).to_json())
+    runner = FakeRunner({"done": []})
+    with pytest.raises(DoraSystemdError, match="robot: it has protocol 2, and this") as caught:
+        node.order_node(scope, cell, STOP, runner)
+    assert caught.value.hint == "doractl restart robot starts the installed version"
+    assert not runner.requests
+
+
 def test_dora_node_stop(scope: Scope, cell: Cell) -> None:
     runner = FakeRunner({"done": ["Node stopping: camera"]})
     words = ["node", "stop", "camera", "-d", "robot"]

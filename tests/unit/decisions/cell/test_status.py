@@ -54,6 +54,7 @@ cells = st.builds(
     st.dictionaries(ids, counts),
     st.dictionaries(ids, st.lists(st.none() | counts, max_size=3).map(tuple)),
     st.sampled_from(["", "0.1.0", "1.0~rc1+git-2"]),
+    counts,
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(),

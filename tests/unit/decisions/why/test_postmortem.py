@@ -129,6 +129,10 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         (RUNS[0], failed("bad-dataflow", "cannot use x")),
         *("Failed", Cause.BAD_DATAFLOW, "", "cannot use x"),
     ),
+    "another version has written the command line": (
+        (RUNS[0], failed("other-version", "cannot read the runner's command line: x")),
+        *("Failed", Cause.OTHER_VERSION, "", "cannot read the runner's command line: x"),
+    ),
     "daemon": (
         (*RUNS, event("daemon-lost", exit="signal SIGKILL"), failed("daemon-lost", "gone")),
         *("Failed", Cause.DAEMON_LOST, "", "gone"),
