@@ -196,6 +196,11 @@ def notice_matches(scope: Scope, name: str) -> list[str]:
     return [*own, "+", *failures, "+", *asked, f"DORA_DATAFLOW_NAME={name}"]
 
 
+def sent_matches(scope: Scope, name: str) -> list[str]:
+    """Matches for the notices that were sent, which nodes cannot write."""
+    return [*_asked_matches(scope, NOTICE_SENT, NOTICE_FAILED), f"DORA_DATAFLOW_NAME={name}"]
+
+
 def request_matches(scope: Scope, *events: str) -> list[str]:
     """Matches for requests of root, or of the user, in that scope."""
     return [*_asked_matches(scope, *events), f"DORA_SCOPE={scope.word}"]

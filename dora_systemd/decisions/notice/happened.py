@@ -27,7 +27,8 @@ FIRST_PAUSE = 15 * SECOND
 """Between the first notice and the next one: no minute has more than five."""
 LAST_PAUSE = 600 * SECOND
 LOOK_BACK = 120 * SECOND
-"""Failures before that are not reported: they may be older than the setting."""
+"""Failures before that are not reported, unless the notice before left them to the next one: they
+may be older than the setting."""
 MOST_RECORDS = 20_000
 _MOST_TEXT = 500
 
@@ -54,11 +55,28 @@ Story = tuple[list[Happened], Sent | None]
 """Failures that no notice has reported, newest first, and the last notice."""
 
 
-def read_story(records: Iterable[Mapping[str, Any]], boot: str, now_us: int) -> Story:
-    """Read what has happened. records: newest first. boot: the id of this boot, as journald's."""
+def read_last(records: Iterable[Mapping[str, Any]], boot: str, now_us: int) -> Sent | None:
+    """Read the last notice of this boot, as long as a pause can follow it. records: newest first.
+
+    It is read by itself: nodes can write more records than read_story() reads.
+    """
+    for record in islice(records, 1):
+        last = _sent(record, _number(record, "__MONOTONIC_TIMESTAMP"))
+        if record.get("_BOOT_ID") == boot and now_us - last.mono_us <= 2 * LAST_PAUSE:
+            return last
+    return None
+
+
+def read_story(
+    records: Iterable[Mapping[str, Any]], boot: str, now_us: int, last: Sent | None = None
+) -> Story:
+    """Read what has happened. records: newest first. boot: the id of this boot, as journald's.
+
+    last: the last notice, if that is known.
+    """
     found: list[Happened] = []
     causes: dict[str, tuple[str, str]] = {}
-    last, bound = None, now_us - LOOK_BACK
+    bound = last.until_us if last else now_us - LOOK_BACK
     for record in islice(records, MOST_RECORDS):
         mono_us = _number(record, "__MONOTONIC_TIMESTAMP")
         if record.get("_BOOT_ID") != boot or mono_us <= bound:

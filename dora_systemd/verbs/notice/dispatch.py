@@ -7,7 +7,7 @@ from contextlib import suppress
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.logs.query import notice_matches
+from dora_systemd.decisions.logs.query import notice_matches, sent_matches
 from dora_systemd.decisions.notice.happened import (
     FAILED,
     FIRST_PAUSE,
@@ -15,6 +15,7 @@ from dora_systemd.decisions.notice.happened import (
     Story,
     next_pause,
     pause_left,
+    read_last,
     read_story,
 )
 from dora_systemd.errors import DoraSystemdError
@@ -38,8 +39,9 @@ def monotonic_us() -> int:
 
 def read_journal(journal: JournalReader, scope: Scope, name: str) -> Story:
     """Read what has happened to a dataflow since its last notice. Raises DoraSystemdError."""
-    records = journal.newest(notice_matches(scope, name), None)
-    return read_story(records, now_boot(), monotonic_us())
+    boot, now_us = now_boot(), monotonic_us()
+    last = read_last(journal.newest(sent_matches(scope, name), 1), boot, now_us)
+    return read_story(journal.newest(notice_matches(scope, name), None), boot, now_us, last)
 
 
 class Dispatcher:

@@ -13,12 +13,14 @@ from dora_systemd.decisions.notice.happened import (
     FIRST_PAUSE,
     LAST_PAUSE,
     LOOK_BACK,
+    MOST_RECORDS,
     Happened,
     Sent,
     format_environment,
     main_one,
     next_pause,
     pause_left,
+    read_last,
     read_story,
     summary,
     variables,
@@ -92,6 +94,27 @@ def test_nothing_of_another_boot_and_nothing_old() -> None:
     old = NOW / SECOND - LOOK_BACK / SECOND
     assert read_story([unit_failed(old, "1")], "b", NOW)[0] == []
     assert len(read_story([unit_failed(old + 1, "1")], "b", NOW)[0]) == 1
+
+
+def test_a_pause_that_is_longer_than_the_look_back() -> None:
+    """In a long storm a notice has all failures since the one before, and the pause still grows."""
+    notice = sent(500, 499)
+    last = read_last([notice], "b", NOW)
+    assert last == Sent(500 * SECOND, 499 * SECOND, 30 * SECOND)
+    records = [*(unit_failed(one, "1") for one in range(998, 400, -2)), notice]
+    found, same = read_story(records, "b", NOW, last)
+    assert same == last
+    assert len(found) == 250
+    assert read_last([{**notice, "_BOOT_ID": "a"}], "b", NOW) is None
+    assert read_last([notice], "b", 501 * SECOND + 2 * LAST_PAUSE) is None
+
+
+def test_a_flood_of_records_does_not_hide_the_last_notice() -> None:
+    flood = [record(999, DORA_EVENT="node-given-up", DORA_NODE="a") for _ in range(MOST_RECORDS)]
+    last = read_last([sent(998, 997)], "b", NOW)
+    found, same = read_story([*flood, sent(998, 997)], "b", NOW, last)
+    assert (len(found), same) == (MOST_RECORDS, last)
+    assert pause_left(same, NOW) == 28 * SECOND
 
 
 def test_other_failures() -> None:
