@@ -48,8 +48,9 @@ def settle(
 ) -> str:
     """Wait until a unit with a start job is up or down; return its ActiveState, or LATE.
 
-    A unit that systemd is about to restart has failed. limit: µs. `tell`: gets the ActiveState and
-    the status text of the unit at each check. is_over: whether to wait no longer. Raises
+    A unit that systemd is about to restart has failed. limit: µs, from the end of the stop of what
+    ran before: TimeoutStopSec= of the unit bounds that stop. `tell`: gets the ActiveState and the
+    status text of the unit at each check. is_over: whether to wait no longer. Raises
     DoraSystemdError.
     """
     deadline = time.monotonic() + limit / SECOND
@@ -60,6 +61,8 @@ def settle(
             return "failed"
         if not is_queued and active not in ON_THE_WAY:
             return active
+        if active == "deactivating":
+            deadline = time.monotonic() + limit / SECOND
         if time.monotonic() > deadline or is_over():
             return LATE
         tell(active, str(facts["StatusText"]))

@@ -15,7 +15,7 @@ from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.lives import now_boot
-from dora_systemd.verbs.releases.soak import Gate
+from dora_systemd.verbs.releases.soak import LATE, Gate, settle
 from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, options, with_owes
 
@@ -246,6 +246,23 @@ def test_what_is_told_until_it_is_ready(scope: Scope, clock: list[float]) -> Non
     assert Gate(manager, scope, options(), told.append)._wait_ready(120 * SECOND) is None
     assert told == expected
     assert clock[0] == pytest.approx(1000.8)
+
+
+def test_what_ran_before_has_its_own_time_to_stop(clock: list[float]) -> None:
+    """A recorder may need longer than the new version may take to be ready."""
+
+    class Changing(FakeManager):
+        def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+            states = {1250: "deactivating", 1252: "activating"}
+            found = [state for until, state in states.items() if clock[0] < until]
+            self.units[unit]["ActiveState"] = [*found, "active"][0]
+            return super().read(unit, names)
+
+    manager = Changing()
+    manager.add(options(), InvocationID=b"\1")
+    assert settle(manager, "dora-robot.service", 3 * SECOND, lambda *_: None) == "active"
+    clock[0] = 1000.0
+    assert settle(manager, "dora-robot.service", 1 * SECOND, lambda *_: None) == LATE
 
 
 def test_what_ran_before_may_still_write_about_its_end(
