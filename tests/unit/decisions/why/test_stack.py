@@ -64,6 +64,39 @@ def test_the_stack_is_of_the_thread_that_crashed() -> None:
     assert str(FRAMES[0]) == "grab_frame (libgrab.so + 0x1119)"
 
 
+OF_252 = """Process 235 (crash.sh) of user 0 dumped core.
+
+Module dora.abi3.so without build-id.
+Stack trace of thread 238:
+#0  0x00007ff970cbdeec n/a (libc.so.6 + 0x8aeec)
+#1  0x00007ff970c6efb2 raise (libc.so.6 + 0x3bfb2)
+#2  0x00007ff970caa994 _IO_puts (libc.so.6 + 0x77994)
+#3  0x00007ff970945b0d ffi_call (libffi.so.8 + 0x6b0d)
+#4  0x00000000004f9f1b PyEval_EvalCode (/usr/bin/python3.11 + 0xf9f1b)
+"""
+OF_262 = """Process 309 (crash.sh) of user 0 dumped core.
+
+Module libuuid.so.1 from deb util-linux-2.42.4-1.amd64
+Module dora.abi3.so without build-id.
+Stack trace of thread 312:
+#0  0x00007f33de032d0c n/a (libc.so.6 + 0x96d0c)
+#1  0x00007f33ddfdc582 raise (libc.so.6 + 0x40582)
+#2  0x00007f33de01dbf2 puts (libc.so.6 + 0x81bf2)
+#3  0x00007f33ddc70fe5 ffi_call (libffi.so.8 + 0xafe5)
+#4  0x000000000058f09d PyEval_EvalCode (/usr/bin/python3.14 + 0x18f09d)
+"""
+
+
+@pytest.mark.parametrize(("text", "puts"), [(OF_252, "_IO_puts"), (OF_262, "puts")])
+def test_the_texts_of_other_versions(text: str, puts: str) -> None:
+    """Written by the systemd-coredump of Debian 12 and forky, called by hand with a core file.
+
+    In a container the kernel calls only the program of its host, so no test can do the same there.
+    """
+    names = [one.function for one in dump_frames(text)]
+    assert names == ["?", "raise", puts, "ffi_call", "PyEval_EvalCode"]
+
+
 @pytest.mark.parametrize(
     "fields",
     [
