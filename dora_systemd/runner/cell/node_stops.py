@@ -23,6 +23,8 @@ from dora_systemd.runner.nodes.watchdog import monotonic_us
 from dora_systemd.values import SECOND
 
 MonotonicUs = Callable[[], int]
+_ENDLESS = 2**62
+"""µs, with an infinite stop_limit: the table that `list` reads has no such numbers."""
 
 
 class NodeStops:
@@ -90,7 +92,8 @@ class NodeStops:
 
     def _set_timer(self, node: str, after: int) -> None:
         self._clear(node)
-        self._nodes.stop_dues[node] = self._clock_us() + after
+        if after < _ENDLESS:
+            self._nodes.stop_dues[node] = self._clock_us() + after
         self._timers[node] = self._loop.call_later(after / SECOND, self._overdue, node)
 
     def _clear(self, node: str) -> None:

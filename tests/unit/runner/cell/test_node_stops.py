@@ -9,7 +9,7 @@ from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import EndNode, GiveTime, State, StopNode
 from dora_systemd.runner.cell.node_stops import NodeStops
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.dialogue import Bench
 from tests.unit.fakes.loop import live, settle
 
@@ -61,6 +61,20 @@ def test_more_time_never_makes_it_shorter(tmp_path: Path) -> None:
         assert bench.nodes.stop_dues == {"a": 1000 + 10 * SECOND}
         bench.stops.perform(GiveTime("a", 20 * SECOND))
         assert bench.nodes.stop_dues == {"a": 1000 + 20 * SECOND}
+
+    live(work)
+
+
+def test_an_infinite_time_is_not_shown(tmp_path: Path) -> None:
+    """The table that `list` reads has no such numbers: it would refuse the whole table."""
+
+    async def work() -> None:
+        bench = Stopping(tmp_path)
+        bench.stops.perform(StopNode("a", 10 * SECOND))
+        bench.stops.perform(GiveTime("a", INFINITY - SECOND))
+        assert bench.nodes.stop_dues == {}
+        bench.stops.perform(EndNode("a", 5 * SECOND))
+        assert bench.nodes.stop_dues == {"a": 1000 + 5 * SECOND}
 
     live(work)
 
