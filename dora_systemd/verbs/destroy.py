@@ -20,6 +20,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE, name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cell, read_cells
+from dora_systemd.verbs.facts.containers import find_outside, with_left
 from dora_systemd.verbs.facts.enabled import own_directories
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.stop import (
@@ -56,10 +57,12 @@ def stop_all(
         cells = [cell for cell in running_cells(manager) if cell.unit not in given_up]
         if not cells:
             return
+        outside = find_outside(manager, [cell.unit for cell in cells])
         for one in stop_within(manager, cells, 0 if want_kill else None, now):
             given_up |= {one.cell.unit} if one.problem else set()
             note = f" ({one.note})" if one.note else ""
-            yield Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}", one.problem)
+            outcome = Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}", one.problem)
+            yield from with_left([outcome], outside)
         end_links_of(manager, cells)
         release_enabled(manager, scope, [cell.unit for cell in cells])
 

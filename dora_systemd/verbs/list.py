@@ -8,6 +8,7 @@ from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
+from dora_systemd.verbs.facts.containers import read_containers
 from dora_systemd.verbs.facts.list import mark_enabled, row_of
 from dora_systemd.verbs.facts.locks import mark_inhibited
 from dora_systemd.verbs.facts.reading import Reading, read_dataflow
@@ -46,7 +47,17 @@ def whole_rows(
 ) -> list[DataflowRow]:
     """The rows that row_of() has made of `readings`, with all that is known."""
     found = [
-        row._replace(restart_budget=restart_budget(manager, scope, one.cell, one.status))
+        _with_containers(one, row)._replace(
+            restart_budget=restart_budget(manager, scope, one.cell, one.status)
+        )
         for one, row in zip(readings, rows, strict=True)
     ]
     return mark_inhibited(scope, mark_enabled(manager, scope, found)) if found else []
+
+
+def _with_containers(reading: Reading, row: DataflowRow) -> DataflowRow:
+    """The row with the containers that its nodes have started."""
+    if not (found := read_containers(reading.groups)):
+        return row
+    nodes = (one._replace(containers=found.get(one.node, ())) for one in row.nodes)
+    return row._replace(nodes=tuple(nodes))

@@ -14,6 +14,7 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
+from dora_systemd.verbs.facts.containers import find_outside, with_left
 from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.facts.reason import job_reason, logs_hint, need_failure, runners_refusal
 from dora_systemd.verbs.node import NodeOrder, order_node, socket_of
@@ -44,13 +45,15 @@ def restart_cells(
     for cell in chosen:
         manager.hold(cell.unit)  # keep a failed transient unit and its failure
         manager.reset_failed(cell.unit)
+    outside = find_outside(manager, [cell.unit for cell in chosen])
     results = manager.run_jobs("RestartUnit", [cell.unit for cell in chosen], observer)
-    return [
+    outcomes = [
         Outcome.of_error(cell, refused[cell])
         if cell in refused
         else _outcome(manager, scope, cell, results[cell.unit], cell in thawed)
         for cell in cells
     ]
+    return with_left(outcomes, outside)
 
 
 def find_refusals(

@@ -17,6 +17,7 @@ from dora_systemd.trust.paths import exists
 from dora_systemd.values import INFINITY, SECOND, format_duration
 from dora_systemd.verbs.facts.budget import read_restarts
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
+from dora_systemd.verbs.facts.containers import find_outside, with_left
 from dora_systemd.verbs.facts.enabled import enabled_units, own_directories, trial_path
 from dora_systemd.verbs.facts.reason import failure_reason
 
@@ -62,6 +63,7 @@ def stop_cells(
     """
     up = [cell.unit for cell in cells if cell.is_up]
     thawed = {unit for unit in up if manager.thaw(unit)}
+    outside = find_outside(manager, up)
     begin = time.time_ns() // _MICROSECOND_NS
     results = manager.run_jobs("StopUnit", up, observer) if up else {}
     outcomes = [
@@ -71,7 +73,7 @@ def stop_cells(
     end_links_of(manager, cells)
     release_enabled(manager, scope, up)
     drop_disabled(manager, scope, [cell.unit for cell in cells])
-    return outcomes
+    return with_left(outcomes, outside)
 
 
 def stop_cells_within(
@@ -79,16 +81,18 @@ def stop_cells_within(
 ) -> list[Outcome]:
     """Stop dataflows as stop_cells() does, and kill those that still run after `most` µs."""
     up = [cell for cell in cells if cell.is_up]
+    outside = find_outside(manager, [cell.unit for cell in up])
     ended = {one.cell: one for one in stop_within(manager, up, most)}
     end_links_of(manager, cells)
     release_enabled(manager, scope, [cell.unit for cell in up])
     drop_disabled(manager, scope, [cell.unit for cell in cells])
-    return [
+    outcomes = [
         Outcome(cell, _stopped(cell, ended[cell].note), ended[cell].problem)
         if cell in ended
         else _not_running(cell)
         for cell in cells
     ]
+    return with_left(outcomes, outside)
 
 
 def stop_within(

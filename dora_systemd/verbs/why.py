@@ -15,6 +15,7 @@ from dora_systemd.decisions.life.causes import NO_END
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.past import FAILED as TRIAL_FAILED
 from dora_systemd.decisions.releases.past import Switch, completed, undone
+from dora_systemd.decisions.resources.containers import format_outside
 from dora_systemd.decisions.views.dataflows import DEGRADED, FAILED, FROZEN
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
@@ -28,12 +29,13 @@ from dora_systemd.names import release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import read_restarts, restart_budget, without_refused
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
+from dora_systemd.verbs.facts.containers import read_containers
 from dora_systemd.verbs.facts.ended import newest_ended, not_recorded
 from dora_systemd.verbs.facts.held import read_held
 from dora_systemd.verbs.facts.list import mark_enabled, read_rows
 from dora_systemd.verbs.facts.lives import now_boot, read_lives
 from dora_systemd.verbs.facts.locks import read_holders
-from dora_systemd.verbs.facts.reading import look_at_table, read_status
+from dora_systemd.verbs.facts.reading import look_at_table, read_dataflow, read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.stack import read_pattern, read_stack
 from dora_systemd.verbs.facts.waits import read_cpu_waits
@@ -71,12 +73,17 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
 
 
 def explain_now(manager: Manager, scope: Scope, selector: str, journal: JournalReader) -> Report:
-    """Explain as explain(), and what the nodes wait for now, which may take a moment."""
+    """Explain as explain(), and what the nodes do now, which may take a moment.
+
+    That is what they wait for, and the containers that they have started.
+    """
     report = explain(manager, scope, selector, journal)
-    if not (report.verdict.is_up and report.subject.is_loaded):
+    is_there = report.verdict.is_up and report.subject.is_loaded
+    if not is_there or (cell := read_cell(manager, report.subject.unit)) is None:
         return report
-    cell = read_cell(manager, report.subject.unit)
-    return replace(report, waits=read_cpu_waits(manager, scope, cell)) if cell else report
+    reading = read_dataflow(manager, scope, cell)
+    outside = format_outside(read_containers(reading.groups))
+    return replace(report, waits=read_cpu_waits(reading), outside=outside)
 
 
 def _verdict(journal: JournalReader, scope: Scope, subject: Subject, facts: Facts) -> Verdict:

@@ -1,4 +1,4 @@
-"""LAB=browser: the tree of LAB=container with Chromium in it, for tests of the status page."""
+"""LAB=browser: the tree of LAB=container with podman, and Chromium for tests of the status page."""
 
 from pathlib import Path
 
@@ -9,7 +9,9 @@ from lab.image import CERTIFICATES, add_dora_user, base_layer, install_checkout,
 from lab.process import run_logged
 
 # Without windows, and without the toolkit that Chromium proper brings for them.
-DEBIAN = ["chromium-headless-shell", "fonts-dejavu-core"]
+DEBIAN = ["chromium-headless-shell", "fonts-dejavu-core", "podman", "uidmap"]
+# A boot starts none of what podman brings.
+UNITS = ["podman.socket", "podman.service", "podman-restart.service", "podman-auto-update.timer"]
 
 
 def ensure_browser(cache: Path) -> Path:
@@ -29,11 +31,13 @@ def build_chromium(path: Path, cache: Path) -> None:
     log = cache / "browser.log"
     log.unlink(missing_ok=True)
     path.rmdir()
-    with Stage(f"{' and '.join(DEBIAN)} from Debian"):
+    with Stage(f"{', '.join(DEBIAN)} from Debian"):
         run_logged(["cp", "--archive", str(base), str(path)], log, "copy the base")
         run_in_tree(path, ["apt-get", "update"], log)
         run_in_tree(path, ["apt-get", "install", "-y", "--no-install-recommends", *DEBIAN], log)
         run_in_tree(path, ["apt-get", "clean"], log)
+        for where in ([], ["--global"]):
+            run_in_tree(path, ["systemctl", *where, "disable", *UNITS], log)
 
 
 def build_browser(path: Path, cache: Path) -> None:

@@ -332,3 +332,10 @@ def signal_group(
                     pidfd_send_signal(pidfd, number)
             finally:
                 os.close(pidfd)
+
+
+def find_groups(is_wanted: Callable[[str], object], most: int) -> list[str]:
+    """The groups of the whole hierarchy with such a name, among the first `most` groups."""
+    top = mount_point()
+    every = islice(_tree(top), most)
+    return [f"/{Path(one).relative_to(top)}" for one in every if is_wanted(one.rpartition("/")[2])]

@@ -132,9 +132,9 @@ def read_flocks(device: int) -> Mapping[int, tuple[int, ...]]:
     return found
 
 
-def read_lock_process(pid: int) -> LockProcess:
+def read_lock_process(pid: int, proc: Path = PROC) -> LockProcess:
     """Read the facts of a process; of an ended process only the pid, with uid -1."""
-    path = PROC / str(pid)
+    path = proc / str(pid)
     with suppress(OSError, ValueError, KeyError, IndexError):
         read = (beginning(path / one, _MOST_OF_PROCESS) for one in ("cmdline", "cgroup", "status"))
         arguments, groups, rest = read

@@ -3,6 +3,7 @@
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.cell.status import format_stopped
+from dora_systemd.decisions.resources.containers import format_outside
 from dora_systemd.decisions.views.dataflows import (
     DEGRADED,
     FAILED,
@@ -49,6 +50,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("Nodes", row.problem),
         ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),
+        ("Outside", format_outside({one.node: one.containers for one in row.nodes})),
         ("Restarts", _restart_words(row)),
         ("Stopped", format_stopped({one.node: one.stopped_by for one in row.nodes})),
         ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),

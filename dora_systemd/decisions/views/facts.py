@@ -17,6 +17,7 @@ from dora_systemd.values import SECOND
 
 if TYPE_CHECKING:
     from dora_systemd.decisions.cell.status import NodeStatus
+    from dora_systemd.decisions.resources.containers import Container
 
 SILENT = "Silent"
 """A node that runs, and sends no output that it owes."""
@@ -69,6 +70,7 @@ class NodeRow(NamedTuple):
     outputs: tuple[OutputRow, ...] = ()
     machine: str = ""  # the machine of the node, "" for this one
     stopped_by: str = ""  # who requested the stop of this node alone, or ""
+    containers: "tuple[Container, ...]" = ()  # that it has started
 
     @property
     def word(self) -> str:
@@ -170,6 +172,10 @@ def _silent(row: NodeRow) -> list[Sample]:
     return [({}, int(bool(row.silent)))] if row.outputs else []
 
 
+def _containers(some: "Sequence[Container]") -> list[dict[str, Any]]:
+    return [one.values() for one in some]
+
+
 def _ages(row: NodeRow) -> list[Sample]:
     return [sample for one in row.outputs for sample in _seconds(one.age, output=one.output)]
 
@@ -220,6 +226,7 @@ NODE_FACTS = (
         metric="silent", help="1 while an output that it owes is missing.", samples=_silent),
     Fact("outputs", value=_outputs, metric="last_output_age_seconds",
         help="Time since the last message of an owed output.", samples=_ages),
+    Fact("containers", value=_containers),
 )  # fmt: skip
 _TOLD = [(one.field or one.key, one.told) for one in NODE_FACTS if one.told]
 

@@ -84,6 +84,7 @@ class Report:
     stack: tuple[Frame, ...] = ()  # of verdict.node, if a signal ended it
     keeps_core_dumps: bool = True  # whether this machine does
     waits: tuple[CpuWait, ...] = ()  # of nodes that run, for a CPU
+    outside: str = ""  # the containers outside of the cgroups of the nodes
 
     @property
     def node(self) -> str:
@@ -207,6 +208,7 @@ def _facts(report: Report) -> list[str]:
         "Machines": _machine_words(report.machines),
         "Memory": _memory_words(verdict.details),
         "CPU": format_cpu_waits(report.waits),
+        "Outside": report.outside,
         "Starved": ", ".join(verdict.starved),
         "Stopped": format_stopped(verdict.stopped),
         "Restarts": _restart_words(verdict.restarts),

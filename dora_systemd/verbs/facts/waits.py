@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_waited
 from dora_systemd.adapters.host.interrupts import Interrupts
@@ -28,12 +27,10 @@ from dora_systemd.decisions.resources.usage import WHOLE_CELL
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.waits import MINUTE, WORTH_SHOWING, CpuWait
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import reached
 from dora_systemd.values import INFINITY, SECOND, cpu_numbers, parse_cpus
-from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.list import row_of
-from dora_systemd.verbs.facts.reading import read_dataflow
+from dora_systemd.verbs.facts.reading import Reading
 
 _SAMPLE_SECONDS = 0.3
 _MOST_BUSY = 10
@@ -45,14 +42,13 @@ Sleep = Callable[[float], None]
 
 
 def read_cpu_waits(
-    manager: Manager, scope: Scope, cell: Cell, proc: Path = PROC, sleep: Sleep = time.sleep
+    reading: Reading, proc: Path = PROC, sleep: Sleep = time.sleep
 ) -> tuple[CpuWait, ...]:
     """Read the nodes that waited for a CPU, the longest wait first.
 
     Where the kernel has no pressure stall information, this measures for a moment. proc: has the
     files of all processes.
     """
-    reading = read_dataflow(manager, scope, cell)
     groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
     waited = {node: read_waited(path) for node, path in groups.items()}
     row = row_of(reading)
@@ -61,7 +57,7 @@ def read_cpu_waits(
         sample = _Sample(groups, waited, proc, sleep)
         cpus = {one.node: one.cpus for one in row.nodes}
         throttled = {one.node: one.throttled for one in row.nodes}
-        late = (sample.wait(node, cpus.get(node, ""), cell.options) for node in groups)
+        late = (sample.wait(node, cpus.get(node, ""), reading.cell.options) for node in groups)
         waits = [one._replace(throttled=throttled.get(one.node)) for one in late]
         found = [one for one in found if one.node not in groups] + waits
     late_ones = [one for one in found if one.is_late]

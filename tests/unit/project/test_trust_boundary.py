@@ -55,7 +55,8 @@ _TABLE = {
         verbs.start.where
     """,
     KERNEL: """
-        adapters.cgroup.groups adapters.host.interrupts adapters.host.process_times
+        adapters.cgroup.groups adapters.host.clients adapters.host.interrupts
+        adapters.host.process_times
         adapters.host.process_table adapters.host.real_time adapters.host.rights
         runner.cell.restarts trust.socket_table verbs.destroy
         link.relay verbs.facts.lives verbs.facts.stack verbs.start.programs verbs.start.sandbox

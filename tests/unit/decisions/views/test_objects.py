@@ -12,7 +12,7 @@ from dora_systemd.values import SECOND
 
 UNKNOWN = DataflowRow("u", "robot", "dora-robot.service", "Failed", nodes=(NodeRow("a", "failed"),))
 KNOWN_OF_IT = {"name", "uuid", "unit", "status", "enabled", "machines", "nodes", "inhibitors"}
-KNOWN_OF_NODE = {"node", "state", "outputs"}
+KNOWN_OF_NODE = {"node", "state", "outputs", "containers"}
 
 
 def test_what_is_unknown_is_null() -> None:
@@ -40,6 +40,7 @@ def test_each_value_of_a_node_is_under_its_key() -> None:
         **{"waits_for": "/dev/x", "text": "hot", "watchdog_us": 5, "watchdog_age_us": 3},
         **{"max_restarts": 2, "essential": True, "scheduling": "fifo:5", "cpus": "2-3"},
         **{"silent": "no image for 2s", "outputs": [], "stop_left_us": 9},
+        "containers": [],
     }
 
 

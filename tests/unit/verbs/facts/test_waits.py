@@ -12,6 +12,7 @@ from dora_systemd.decisions.resources.rivals import Rival
 from dora_systemd.decisions.why.waits import MINUTE, CpuWait
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.reading import read_dataflow
 from dora_systemd.verbs.facts.waits import read_cpu_waits, shared_interrupts
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options, with_limits, with_texts
@@ -70,7 +71,7 @@ def waits(scope: Scope, proc: Path, cpus: str = "") -> tuple[CpuWait, ...]:
         time.sleep(seconds)
         use_cpu(proc, seconds)
 
-    return read_cpu_waits(manager, scope, cell, proc, sleep)
+    return read_cpu_waits(read_dataflow(manager, scope, cell), proc, sleep)
 
 
 def test_nobody_waits(scope: Scope, write: Write, proc: Path) -> None:
