@@ -27,7 +27,7 @@ from dora_systemd.names import is_name, is_uuid_prefix
 
 VARIABLE = "_DORACTL_COMPLETE"
 
-_OF_THE_PAST = ("bundle", "list", "logs", "restart", "start", "why")
+_OF_THE_PAST = ("advise", "bundle", "list", "logs", "restart", "start", "why")
 """Verbs that also accept dataflows that only the journal knows."""
 
 _RUNNING_ONLY = ("stop", "dora", "env", "top")

@@ -18,8 +18,8 @@ from dora_systemd.terminal_text import escaped, one_line
 _STANDARD = ("stdin", "stdout", "stderr")
 """Streams by file descriptor."""
 VERBS = (
-    *("build", "bundle", "bundles", "deploy", "destroy", "disable", "doctor", "dora", "enable"),
-    *("env", "export"),
+    *("advise", "build", "bundle", "bundles", "deploy", "destroy", "disable", "doctor", "dora"),
+    *("enable", "env", "export"),
     *("forget", "inhibit", "list", "logs", "machine", "member", "node", "releases", "reload"),
     *("reset", "restart", "rollback", "run", "set", "setup", "show", "start", "stop", "top"),
     *("up", "version", "why"),

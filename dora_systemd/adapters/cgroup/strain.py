@@ -31,16 +31,16 @@ def read_oom(path: Path) -> OomCounts:
 
 
 def read_load(path: Path) -> Load:
-    """Read how close a group is to its memory limit; the caller adds the throttling of its CPU.
+    """Read how much memory a group holds, and how close it is to its limit.
 
-    Only memory counts that the kernel cannot drop: caches of files fill every group up.
+    The caller adds what concerns its CPU. Only memory counts that the kernel cannot drop: caches of
+    files fill every group up.
     """
+    stat = read_numbers(path / "memory.stat")
+    held = stat.get("anon", 0) + stat.get("shmem", 0)
     limits = [read_number(path / name) for name in ("memory.max", "memory.high")]
     limit = min((one for one in limits if one is not None), default=INFINITY)
-    if limit == INFINITY:
-        return Load()
-    stat = read_numbers(path / "memory.stat")
-    return Load(stat.get("anon", 0) + stat.get("shmem", 0), limit, _read_stalled(path))
+    return Load(held) if limit == INFINITY else Load(held, limit, _read_stalled(path))
 
 
 def read_waited(path: Path) -> float | None:

@@ -36,6 +36,32 @@ class Load:
     # percent of the time since the last sample in which the CPU limit throttled the group, None
     # without one
     throttled: float | None = None
+    # percent of one processor: used since the last sample, and the limit, or None
+    cpu: float = 0.0
+    cpu_limit: float | None = None
+
+
+@dataclass(frozen=True)
+class Most:
+    """The most that a group has used in any sample, as in Load."""
+
+    held: int = 0
+    cpu: float = 0.0
+
+    def after(self, load: Load) -> "Most":
+        """Return it after one more sample."""
+        return Most(max(self.held, load.held), max(self.cpu, load.cpu))
+
+    def details(self) -> dict[str, str]:
+        """Details of the event with which a node or a dataflow ends; what is not known is left out.
+
+        `advise` reads them.
+        """
+        known = {
+            "held_peak": str(self.held or ""),
+            "cpu_peak": f"{self.cpu:.0f}" if self.cpu else "",
+        }
+        return {key: text for key, text in known.items() if text}
 
 
 @dataclass(frozen=True)
@@ -100,7 +126,8 @@ def _report(event: str, key: str, load: Load) -> Report:
     if event == CPU:
         share = f"{load.throttled or 0.0:.0f}"
         reason = f"{whose} had to wait for the limit {share}% of the time"
-        return (event, key, {"reason": reason, "throttled": share})
+        own = {} if load.cpu_limit is None else {"cpu_limit": f"{load.cpu_limit:.0f}"}
+        return (event, key, {"reason": reason, "throttled": share, **own})
     held, limit = format_rounded_size(load.held), format_rounded_size(load.limit or 0)
     stalled = f"{load.stalled:.0f}"
     holds = "hold" if is_whole else "holds"

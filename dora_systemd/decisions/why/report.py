@@ -324,6 +324,8 @@ _NUMBERS = {
     "peak": "memory_peak_bytes",
     "limit": "memory_limit_bytes",
     "held": "memory_bytes",
+    "held_peak": "memory_held_peak_bytes",
+    "cpu_peak": "cpu_peak_percent",
     "node_pid": "pid",
     "exit_status": "exit_status",
     "n_restarts": "n_restarts",

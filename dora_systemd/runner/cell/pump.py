@@ -46,6 +46,8 @@ from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
+_ENDS = (*END_EVENTS, *NODE_END_EVENTS)
+
 
 def now_us() -> int:
     """Read CLOCK_REALTIME in µs."""
@@ -167,7 +169,8 @@ class Pump:
     def _record(self, record: Record) -> None:
         with self._guard(f"do what comes before the event {record.event}"):
             self._prepare(record)
-        self._pipes.write_event(record.event, record.node or None, **record.details)
+        used = self._nodes.resources.most(record.node) if record.event in _ENDS else {}
+        self._pipes.write_event(record.event, record.node or None, **{**used, **record.details})
 
     def _prepare(self, record: Record) -> None:
         if record.event in END_EVENTS:

@@ -12,8 +12,15 @@ from dora_systemd.decisions.cell.log_backlog import Marks
 from dora_systemd.decisions.cell.owes import PROBE
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_owner, largest
-from dora_systemd.decisions.resources.pressure import Alarms, Load, look
-from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, throttled_percent
+from dora_systemd.decisions.resources.pressure import Alarms, Load, Most, look
+from dora_systemd.decisions.resources.usage import (
+    WHOLE_CELL,
+    CpuSample,
+    cpu_percent,
+    limit_of,
+    throttled_percent,
+)
+from dora_systemd.values import SECOND
 
 _ONE_SHORTAGE = 5.0
 """Seconds in which the kernel kills further processes for the same reason."""
@@ -28,6 +35,7 @@ class Resources:
         self._short_until = 0.0
         self._seen: dict[Path, OomCounts] = {unit: read_oom(unit)}
         self._alarms: Alarms = {}
+        self._most: dict[str, Most] = {}
 
     def explain(self, group: Path) -> Oom | None:
         """Find whether a process in a group has just been killed because of memory, and how."""
@@ -64,16 +72,25 @@ class Resources:
         nodes.pop(PROBE, None)  # it is no node of the dataflow
         groups = {WHOLE_CELL: self._unit, **nodes}
         loads = {key: _load(path, key, samples, now) for key, path in groups.items()}
+        self._most |= {key: self._most.get(key, Most()).after(one) for key, one in loads.items()}
         self._alarms, reports = look(self._alarms, loads, now.at_us)
         return [Record(*one) for one in reports]
 
+    def most(self, key: str) -> dict[str, str]:
+        """Return the details of an end: the most that a node, or WHOLE_CELL, has used so far."""
+        return self._most.get(key, Most()).details()
+
 
 def _load(path: Path, key: str, samples: tuple[CpuSample, ...], now: CpuSample) -> Load:
-    load = read_load(path)
+    # Without an earlier sample the time that was used is not known.
+    used = cpu_percent(samples, now, key) if samples else 0.0
+    load = replace(read_load(path), cpu=used)
     # A group without a CPU limit is never throttled.
     if not any(now.throttling.get(key, ())):
         return load
-    return replace(load, throttled=throttled_percent(samples, now, key))
+    share = limit_of(cgroup.read_usage(path).cpu_max)
+    limit = None if share is None else 100 * share / SECOND
+    return replace(load, throttled=throttled_percent(samples, now, key), cpu_limit=limit)
 
 
 class Hold:

@@ -6,6 +6,10 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.advice.evidence import Recorded, Seen
+from dora_systemd.decisions.advice.report import AdviceReport
+from dora_systemd.decisions.advice.report import report_object as advice_object
+from dora_systemd.decisions.advice.rules import Advice
 from dora_systemd.decisions.cell.status import NODE_STATES
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.releases.progress import STAGES, checking
@@ -155,6 +159,15 @@ def test_keys_within_objects_are_named() -> None:
     finding = finding_values(Finding("dora", State.OK, "version 1"))
     assert all(f"Va {key}" in text["Others"] for key in ("topic", "state", "text", "remedy"))
     assert list(finding) == ["topic", "state", "text", "remedy"]
+    advice = report_of_advice()
+    for key in (*advice, *advice["advice"][0]):
+        assert re.search(rf"\.Va .*\b{key}\b", text["Others"]), key
+
+
+def report_of_advice() -> dict[str, Any]:
+    seen = (Seen(1, READY, 0),)
+    advice = Advice("a", ("memory_limit",), "", "1G", False, "held at most 900M", seen)
+    return advice_object(AdviceReport("robot", UUID, Recorded(3, SECOND, {}), [advice]))
 
 
 def nested(values: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -46,7 +46,7 @@ ONLY_IMPORTERS = {
     "pystemd": {"adapters.bus.library"},
     "systemd": {"adapters.journal.socket", "adapters.journal.reader", "adapters.host.notify"},
     "websockets": {"adapters.dora.websocket", "gateway.connection", "gateway.server"},
-    "yaml": {"adapters.host.files", "adapters.host.yaml_loader"},
+    "yaml": {"adapters.host.files", "adapters.host.yaml_edit", "adapters.host.yaml_loader"},
     "watchfiles": {"adapters.host.watch"},
 }
 """Packages of others, and the modules of ours that may import them."""

@@ -44,8 +44,9 @@ OTHERWISE = (
 
 _TABLE = {
     DOOR: """
-        trust.courier trust.eyes trust.files trust.locks trust.paths trust.project trust.programs
-        trust.requests trust.rings trust.sight trust.sockets trust.terminals trust.tree
+        trust.courier trust.eyes trust.files trust.locks trust.owned trust.paths
+        trust.project trust.programs trust.requests trust.rings trust.scribe
+        trust.sight trust.sockets trust.terminals trust.tree
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh cli.main

@@ -37,7 +37,7 @@ class Side:
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.replies: list[Reply] = []
         self.hangs = False
-        self.resources = SimpleNamespace(look=lambda *_: [])
+        self.resources = SimpleNamespace(look=lambda *_: [], most=lambda _: {})
         self.notify_sockets = None
         self.stop_dues: dict[str, int] = {}
 

@@ -311,6 +311,17 @@ def test_samples_and_what_is_said_about_them(tmp_path: Path, state: State, count
     live(work)
 
 
+def test_the_end_of_a_node_says_what_it_has_used(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.RUNNING)
+        bench.nodes.resources.used = {"held_peak": "7"}
+        bench.push(life.NodeReady(1, "a"), life.NodeExited(2, "a", exit_of(1), will_restart=False))
+        used = [(name, details.get("held_peak")) for name, _, details in bench.pipes.events]
+        assert used[:2] == [("node-ready", None), ("node-crashed", "7")]
+
+    live(work)
+
+
 def test_what_was_so_for_a_moment_was_so(tmp_path: Path) -> None:
     """The task that waits runs after the events: a reload must not wait for a start that was."""
 

@@ -65,6 +65,31 @@ def test_each_death_is_explained_once(unit: Path) -> None:
     assert last.owner is Owner.MACHINE
 
 
+def test_the_most_that_a_group_has_used(unit: Path) -> None:
+    resources, stat = Resources(unit), unit / "node-a/memory.stat"
+    assert resources.most("a") == {}
+    (unit / "node-a/memory.max").write_text("max\n")
+    samples: tuple[CpuSample, ...] = ()
+    for number, (held, cpu) in enumerate(((20, 0), (50, 4_000_000), (30, 5_000_000))):
+        stat.write_text(f"anon {held * MIB}\nfile 99999999\nshmem {2 * MIB}\n")
+        now = CpuSample(number * 5_000_000, {"a": cpu})
+        assert [one.node for one in resources.look(samples, now)] == []
+        samples = (now,)
+    assert resources.most("a") == {"held_peak": str(52 * MIB), "cpu_peak": "80"}
+    assert resources.most("b") == {}, "no memory.stat, and no CPU time"
+
+
+def test_the_limit_that_throttles(unit: Path) -> None:
+    resources = Resources(unit)
+    (unit / "node-b/cpu.max").write_text("150000 100000\n")
+    found = []
+    for number in range(4):
+        before = (CpuSample(number * 5_000_000, {}, {"b": (50 * number, 45 * number)}),)
+        later = 50 * (number + 1), 45 * (number + 1)
+        found += resources.look(before, CpuSample((number + 1) * 5_000_000, {}, {"b": later}))
+    assert [one.details["cpu_limit"] for one in found] == ["150"]
+
+
 def test_limits_that_come_close(unit: Path) -> None:
     resources = Resources(unit)
     (unit / "node-a/memory.stat").write_text(f"anon {50 * MIB}\nfile 7\nshmem {10 * MIB}\n")

@@ -1,0 +1,100 @@
+"""A file is replaced in one step, with the permissions of its owner, if it is as it was read."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.owned import replace_file
+from dora_systemd.trust.scribe import replace_text
+from tests.unit.trust.test_sight import OTHER, can_run_python
+
+OWN = os.geteuid()
+
+
+@pytest.fixture(params=["own", "other"])
+def owner(request: pytest.FixtureRequest) -> int:
+    if request.param == "own":
+        return OWN
+    if not can_run_python(OTHER):
+        pytest.skip("only root can write as another user, and if that user can run this Python")
+    return OTHER.uid
+
+
+@pytest.fixture
+def place(owner: int) -> Iterator[Path]:
+    """A directory of the owner."""
+    with TemporaryDirectory(dir="/tmp") as name:
+        os.chown(name, owner, -1)
+        yield Path(name)
+
+
+def make(path: Path, data: bytes, owner: int, mode: int = 0o640) -> Path:
+    path.write_bytes(data)
+    path.chmod(mode)
+    os.chown(path, owner, -1)
+    return path
+
+
+def test_a_file_is_replaced(place: Path, owner: int) -> None:
+    path = make(place / "ä", b"old", owner)
+    replace_file(str(path), b"old", b"new" * 50_000, owner)
+    found = path.stat()
+    assert path.read_bytes() == b"new" * 50_000
+    assert (found.st_uid, found.st_mode & 0o7777) == (owner, 0o640)
+    assert [one.name for one in place.iterdir()] == ["ä"]
+
+
+def test_a_file_is_created(place: Path, owner: int) -> None:
+    replace_file(f"{place}/new", b"", b"text", owner)
+    found = (place / "new").stat()
+    assert (found.st_uid, found.st_mode & 0o7777, found.st_size) == (owner, 0o644, 4)
+
+
+def test_what_has_changed_stays(place: Path, owner: int) -> None:
+    path = make(place / "a", b"newer", owner)
+    for before in (b"old", b"", b"new"):
+        with pytest.raises(DoraSystemdError, match=r"cannot write .*: it was changed meanwhile"):
+            replace_file(str(path), before, b"x", owner)
+    assert path.read_bytes() == b"newer"
+    with pytest.raises(DoraSystemdError, match="No such file"):
+        replace_file(f"{place}/gone", b"old", b"x", owner)
+    assert [one.name for one in place.iterdir()] == ["a"]
+
+
+def test_no_link_and_no_device_is_followed(place: Path, owner: int) -> None:
+    target = make(place / "target", b"old", owner)
+    (place / "link").symlink_to(target)
+    os.mkfifo(place / "pipe")
+    os.chown(place / "pipe", owner, -1)
+    for name in ("link", "pipe"):
+        with pytest.raises(DoraSystemdError, match="cannot write"):
+            replace_file(f"{place}/{name}", b"old", b"x", owner)
+    assert target.read_bytes() == b"old"
+
+
+@pytest.mark.skipif(not can_run_python(OTHER), reason="only root can write as another user")
+def test_root_lends_no_permission() -> None:
+    """Whatever the user has put in the place of the file, it is that user who writes."""
+    with TemporaryDirectory(dir="/tmp") as name:
+        os.chown(name, 0, 0)
+        Path(name).chmod(0o755)
+        path = make(Path(name, "settings"), b"old", 0, 0o644)
+        with pytest.raises(DoraSystemdError, match="Permission denied"):
+            replace_file(str(path), b"old", b"x", OTHER.uid)
+        assert path.read_bytes() == b"old"
+        with pytest.raises(DoraSystemdError, match="Permission denied"):
+            replace_file(f"{name}/new", b"", b"x", OTHER.uid)
+        assert [one.name for one in Path(name).iterdir()] == ["settings"]
+
+
+def test_a_full_disk_leaves_the_old_file() -> None:
+    """/proc takes no new file."""
+    with pytest.raises(DoraSystemdError) as caught:
+        replace_file("/proc/new", b"", b"x", OWN)
+    assert caught.value.code in (ExitCode.FAILURE, ExitCode.NO_PERMISSION)
+    with pytest.raises(FileNotFoundError):
+        replace_text("/nowhere/new", b"", b"x")
