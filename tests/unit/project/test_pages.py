@@ -2,10 +2,6 @@
 
 import re
 
-import yaml
-
-from dora_systemd.decisions.views import prometheus
-from dora_systemd.decisions.views.prometheus import Family
 from tests.deb.picture import lines_of_readme, text_of
 from tests.system.typed import command_of, typed_lines
 from tests.unit.checkout import CHECKOUT
@@ -45,15 +41,3 @@ def test_the_picture_shows_what_readme_says() -> None:
     assert len(shown) == 5
     for line, text in shown.items():
         assert text and said[line].fits(text, 0), line
-
-
-def test_alerts_are_about_metrics_that_exist() -> None:
-    families = [one for one in vars(prometheus).values() if isinstance(one, Family)]
-    families += [*prometheus.GROUP_FAMILIES, *(one for _, one in prometheus.FACT_FAMILIES)]
-    names = {one.name for one in families}
-    text = (CHECKOUT / "docs/monitoring.md").read_text()
-    blocks = [yaml.safe_load(one) for one in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]
-    rules = [rule for one in blocks for group in one.get("groups", []) for rule in group["rules"]]
-    used = re.findall(r"dora_(?:dataflow|node)_(\w+)", " ".join(rule["expr"] for rule in rules))
-    assert len(rules) == 7
-    assert not set(used) - names
