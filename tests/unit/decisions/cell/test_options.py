@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.cell.line_rates import ALL_NODES
 from dora_systemd.decisions.cell.options import (
     MODULES,
     RunnerOptions,
@@ -19,7 +18,6 @@ from dora_systemd.decisions.cell.options import (
     parse_runner_argv,
     runner_command,
 )
-from dora_systemd.decisions.cell.owes import SHORTEST as SHORTEST_TIME
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 
@@ -29,10 +27,6 @@ OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora"
 texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))
 paths = texts.map(lambda text: "/" + text)
 idents = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
-nodes = st.just(ALL_NODES) | idents
-times = st.integers(1, 10**12)
-outputs = st.from_regex(r"[a-z][a-z0-9_/:.-]{0,20}", fullmatch=True)
-spans = st.integers(SHORTEST_TIME, 10**12)
 given_settings = st.builds(SettingText, st.just("") | idents, st.sampled_from([*MODULES]), texts)
 options = st.builds(
     RunnerOptions,

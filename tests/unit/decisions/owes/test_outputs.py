@@ -32,7 +32,6 @@ from dora_systemd.values import INFINITY, SECOND
 from tests.unit.decisions.cell.test_launch import plan
 from tests.unit.fakes.manager import with_owes
 
-OPTIONS = plan().options
 CAMERA = Owed("camera", "image", 2 * SECOND)
 
 
