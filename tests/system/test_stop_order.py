@@ -37,6 +37,20 @@ def test_the_recorder_is_told_last_and_has_its_time(cell: Cell, project: Project
 
 
 @pytest.mark.lab
+@pytest.mark.warns("failed to receive reply from daemon", "Signal(15)")
+def test_a_node_that_waits_or_was_stopped_holds_nobody(cell: Cell, project: Project) -> None:
+    dataflow, device = flow(project), project.write("device", "")
+    settings = project.root / "flow.systemd.yml"
+    project.write("flow.systemd.yml", f"{settings.read_text()}  camera: {{needs: {device}}}\n")
+    start(cell, dataflow)
+    device.unlink()
+    wait_for("it waits", lambda: cell.status.nodes["camera"].state == "waiting")
+    cell.doractl("node", "stop", cell.name, "arm")
+    cell.doractl("stop", cell.name)
+    assert len(episodes(project)) == 1
+
+
+@pytest.mark.lab
 def test_more_time_as_long_as_the_node_asks_for_it(cell: Cell, project: Project) -> None:
     dataflow = flow(project, "{within: 1s, after: [camera, arm]}")
     project.write("extend", "")
