@@ -188,8 +188,12 @@ def variables(
 def plain(value: object) -> str:
     """Return a text of a record as one line that an environment variable can contain.
 
-    Nodes choose parts of it, so a line break must not begin another header or message.
+    Nodes choose parts of it, so a line break must not begin another header or message. A text with
+    one is a list of bytes in the journal's JSON.
     """
+    if isinstance(value, list):
+        numbers = (one for one in value if isinstance(one, int) and 0 <= one < 256)
+        value = bytes(numbers).decode("utf-8", "replace")
     text = "".join(one if one.isprintable() and is_readable(one) else " " for one in str(value))
     return " ".join(text.split())[:_MOST_TEXT]
 
