@@ -15,7 +15,10 @@ from typing import Any
 from dora_systemd.adapters.bundles.reader import opened
 from dora_systemd.adapters.dora.command import parse_dora_version, version_numbers
 from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.adapters.host.yaml_edit import with_value
 from dora_systemd.adapters.runner_socket.client import parse_line
+from dora_systemd.decisions.advice.evidence import collect
+from dora_systemd.decisions.advice.rules import Current, advise
 from dora_systemd.decisions.bundles.manifest import parse_manifest
 from dora_systemd.decisions.cell.environment import SET_VARIABLE, changes_of
 from dora_systemd.decisions.cell.environment_file import parse_environment_file
@@ -67,7 +70,7 @@ from dora_systemd.decisions.releases.program_versions import parse_versions
 from dora_systemd.decisions.releases.progress import soaking
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.settings.table import SETTINGS
-from dora_systemd.decisions.why.lives import find_lives, parse_happening
+from dora_systemd.decisions.why.lives import Life, find_lives, parse_happening
 from dora_systemd.decisions.why.stack import Crash, dump_frames, find_dump, python_frames
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import name_from_path, parse_name, parse_uuid
@@ -177,7 +180,21 @@ def _encoder(data: bytes) -> bytes:
     return encoder.entry(data.replace(b"\n", b""))
 
 
-def _happenings(data: bytes) -> object:
+def _edit(data: bytes) -> None:
+    """A settings file that `advise --apply` changes: what it makes is still YAML, or refused."""
+    text = decoded(data, FILE)
+    parse_yaml(text, FILE, allow_empty=True)
+    for place in (("memory_limit",), ("nodes", "a", "stop", "within"), ("nodes", "a", "owes", "x")):
+        if (after := with_value(text, place, "1G")) is not None:
+            with suppress(DoraSystemdError):
+                parse_yaml(after, FILE)
+
+
+def _advice(data: bytes) -> object:
+    return advise(collect(_happenings(data), {}), Current(frozenset({"camera", "a"})))
+
+
+def _happenings(data: bytes) -> list[Life]:
     records = [loaded(line) for line in data.splitlines()]
     found = [parse_happening(record) for record in records if isinstance(record, dict)]
     return find_lives([one for one in found if one is not None])
@@ -269,6 +286,8 @@ TARGETS = {
     "line-splitter": Target(_splitter),
     "line-encoder": Target(_encoder),
     "journal": Target(_happenings),
+    "advice": Target(_advice),
+    "edit": Target(_edit, REFUSED),
     "stack": Target(_stack),
     "daemon-line": Target(lambda data: parse_daemon_line(text_of(data), 1)),
     "terminal": Target(_terminal),
