@@ -21,7 +21,10 @@ from tests.system.terminal import shown
 LINES = int(os.environ.get("DORA_LOG_LINES", "30000"))
 OURS = re.compile(r"\d{8} flood$|last \d{8}$|half a line$")
 # How zenoh's warnings begin when a node has gone before another one has found it.
-LOST = ("is lost", "failed", "Failed", "exited", "connection error", "disconnected", "killed")
+LOST = (
+    *("is lost", "failed", "Failed", "exited", "connection error", "disconnected", "killed"),
+    "Could not connect",  # the daemon tries again until it is ended
+)
 
 # Writes whole lines, at most PIPE_BUF bytes at once: zenoh prints to the same pipe, in the middle
 # of a line of Python's buffered stdout it would spoil that line before we see it.
