@@ -85,8 +85,8 @@ def test_a_node_of_its_own_within_limits(tmp_path: Path) -> None:
     (node,) = bench.added()
     assert node["id"] == f"{RECORDER}.1"
     assert node["inputs"] == {
-        "0": {"source": "a/image", "queue_size": 30},
-        "1": {"source": "b/x", "queue_size": 30},
+        "0": {"source": "a/image", "queue_size": 4},
+        "1": {"source": "b/x", "queue_size": 4},
     }
     assert f"{RECORDER} / keep /p -u " in node["args"]
     assert str(tmp_path / "ring.sock") in node["args"]
