@@ -24,12 +24,12 @@ from dora_systemd.values import (
 
 RECORDER = "dora-systemd-recorder"
 """The beginning of dora's id of the recorder; its cgroup is node-RECORDER."""
-KEYS = ("last", "memory", "after", "outputs")
+KEYS = ("last", "memory", "outputs")
 MEGABYTE = 1024 * 1024
 ROOM = 160 * MEGABYTE
 """Bytes that the recorder uses besides the ring: Python, pyarrow and the messages on their way."""
-_SHORTEST, _LEAST = SECOND, MEGABYTE
-_FORM = "last=30s,memory=200M,after=2s,outputs=NODE/OUTPUT+NODE/OUTPUT"
+_LEAST = MEGABYTE
+_FORM = "last=30s,memory=200M,outputs=NODE/OUTPUT+NODE/OUTPUT"
 _HINT = f"write {_FORM}, any of these keys; yes or no"
 
 
@@ -38,7 +38,6 @@ class Record(NamedTuple):
 
     last: int = 10 * SECOND  # µs of messages before the last one of each output
     memory: int = 32 * MEGABYTE  # bytes of all messages
-    after: int = 2 * SECOND  # µs after a failure that the file contains, too
     # those to record, NODE/OUTPUT; empty: all, but of large messages only the last one
     outputs: tuple[str, ...] = ()
 
@@ -68,9 +67,8 @@ def record_of(values: Mapping[str, str], outputs: Sequence[str] = ()) -> Record:
             )
     default = Record(outputs=tuple(dict.fromkeys(map(_output, outputs))))
     return default._replace(
-        last=_time("last", values["last"]) if "last" in values else default.last,
+        last=_time(values["last"]) if "last" in values else default.last,
         memory=_memory(values["memory"]) if "memory" in values else default.memory,
-        after=_time("after", values["after"]) if "after" in values else default.after,
     )
 
 
@@ -82,10 +80,10 @@ def _output(text: str) -> str:
     return name
 
 
-def _time(key: str, text: str) -> int:
-    time, least = parse_duration(text), _SHORTEST if key == "last" else 0
-    if not least <= time < INFINITY:
-        raise _wrong(f"{key} is {quoted(text)}", "write a time such as 30s, of a second or more")
+def _time(text: str) -> int:
+    time = parse_duration(text)
+    if not SECOND <= time < INFINITY:
+        raise _wrong(f"last is {quoted(text)}", "write a time such as 30s, of a second or more")
     return time
 
 
@@ -104,9 +102,9 @@ def format_record(record: Record | None) -> str:
     """Format for the runner's command line."""
     if record is None:
         return "no"
-    last, after = format_duration(record.last), format_duration(record.after)
+    last = format_duration(record.last)
     names = f",outputs={'+'.join(record.outputs)}" if record.outputs else ""
-    return f"last={last},memory={format_size(record.memory)},after={after}{names}"
+    return f"last={last},memory={format_size(record.memory)}{names}"
 
 
 def is_recorder(node: str) -> bool:

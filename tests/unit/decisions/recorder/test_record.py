@@ -28,7 +28,7 @@ NODES = [
     parse_node({"id": "arm", "path": "b.py", "outputs": ["state"]}, 1, "robot.yml"),
     parse_node({"id": "sink", "path": "c.py"}, 2, "robot.yml"),
 ]
-WHOLE = Record(30 * SECOND, 200 * MEGABYTE, 0, ("camera/image", "arm/state"))
+WHOLE = Record(30 * SECOND, 200 * MEGABYTE, ("camera/image", "arm/state"))
 
 
 def of_file(value: Any) -> Any:
@@ -37,10 +37,10 @@ def of_file(value: Any) -> Any:
 
 
 def test_it_is_written_in_a_file_and_as_text() -> None:
-    whole = {"last": "30s", "memory": "200M", "after": 0, "outputs": ["camera/image", "arm/state"]}
+    whole = {"last": "30s", "memory": "200M", "outputs": ["camera/image", "arm/state"]}
     assert of_file(whole) == WHOLE
     text = format_record(WHOLE)
-    assert text == "last=30s,memory=200M,after=0,outputs=camera/image+arm/state"
+    assert text == "last=30s,memory=200M,outputs=camera/image+arm/state"
     assert parse_record(text) == of_file(text) == WHOLE
     assert of_file({"outputs": "camera/image"}).outputs == ("camera/image",)
 
@@ -66,7 +66,7 @@ def test_the_defaults(value: Any, expected: Any) -> None:
         ("last=1s,last=2s", "is none"),
         ("lst=1s", "unknown key 'lst'"),
         ("last=10ms", "last is '10ms'"),
-        ("after=infinity", "after is 'infinity'"),
+        ("last=infinity", "last is 'infinity'"),
         ("memory=100K", "memory is '100K'"),
         ("outputs=camera", "'camera' is no output"),
         ("outputs=camera/image+", "'' is no output"),

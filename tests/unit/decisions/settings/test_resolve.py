@@ -221,7 +221,7 @@ def test_values_and_back(data: st.DataObject) -> None:
         "stop_limit": st.integers(0, 2**60),
         "stop": st.builds(NodeStop, st.just(""), st.integers(1, 2**60), st.just(("arm", "cam"))),
         "on_failure": st.just(("/bin/x", "a b", "$c")) | st.just(("unit:tell@.service",)),
-        "record": st.sampled_from([None, Record(), Record(SECOND, 1 << 20, 0, ("cam/image",))]),
+        "record": st.sampled_from([None, Record(), Record(SECOND, 1 << 20, ("cam/image",))]),
         "owes": st.just((Owed("cam", "image", 2 * SECOND),)) | st.just(()),
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
