@@ -182,7 +182,7 @@ def test_after_a_kill_it_is_all_there(cell: Cell, project: Project, who: str) ->
     last, seed = 0, random.Random(who)
     for _ in range(ROUNDS):
         more = last + seed.randrange(10, 40)
-        wait_for("it records", partial(has_more, more))
+        wait_for("it records", partial(has_more, more), 120)  # the delay of restarts grows
         pid = wait_for("it runs", lambda: victim(cell, who))
         before = Ring().last()
         os.kill(pid, signal.SIGKILL)
