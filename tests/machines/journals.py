@@ -22,6 +22,8 @@ lost = pytest.mark.warns(*LOST)
 killed = pytest.mark.warns(
     "Main process exited, code=killed, status=9/KILL", "Failed with result 'signal'"
 )
+AGAIN = ("failed to connect to dora-coordinator", "Could not connect to WS at")
+"""Of a daemon that is ended while it tries to reach a coordinator that has gone."""
 BUSY = (
     *("node exited with error: Signal(15)", "State 'stop-post' timed out"),
     *("failed to send log message to dora-coordinator", "WS send channel closed"),
