@@ -12,7 +12,7 @@ from dora_systemd.adapters.bundles.store import BundleStore, Stored, unusable
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.bundles.manifest import README, WHY, no_bundle
 from dora_systemd.decisions.bundles.table import BundleRow
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_name
 from dora_systemd.scope import Scope
 from dora_systemd.terminal_text import cut, one_line
@@ -40,15 +40,7 @@ def kept_names(scope: Scope) -> list[str]:
 
 def find_name(manager: Manager, scope: Scope, selector: str) -> str:
     """The dataflow that is meant: one with bundles, that systemd knows, or that has ended."""
-    wanted, kept = Selector(selector), kept_names(scope)
-    if name := next((one for one in wanted.names if one in kept), ""):
-        return name
-    try:
-        return wanted.find(manager).name
-    except DoraSystemdError as error:
-        if error.code is ExitCode.NOT_FOUND and (ended := wanted.ended(scope)):
-            return ended.name
-        raise
+    return Selector(selector).find_name(manager, scope, kept_names(scope))
 
 
 def read_bundles(scope: Scope, names: Sequence[str]) -> list[BundleRow]:

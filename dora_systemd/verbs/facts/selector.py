@@ -44,8 +44,8 @@ class Selector:
     """The text that a user has typed: a name, a unit, a UUID, or the beginning of a UUID.
 
     Only meant() decides what a text means. only(), proven(), loaded(), find(), find_present(),
-    find_enabled() and ended() differ in where they look. They raise DoraSystemdError: USAGE if
-    several dataflows match, and those that return no None, NOT_FOUND if none does.
+    find_enabled(), find_name() and ended() differ in where they look. They raise DoraSystemdError:
+    USAGE if several dataflows match, and those that return no None, NOT_FOUND if none does.
     """
 
     text: str
@@ -149,6 +149,20 @@ class Selector:
         from dora_systemd.verbs.facts.ended import ended_rows
 
         return next(iter(self.meant(ended_rows(scope))), None)
+
+    def find_name(self, manager: Manager, scope: Scope, kept: Sequence[str]) -> str:
+        """Find the name of a dataflow in `kept`, or of one that systemd knows or that has ended.
+
+        kept: the names of dataflows of which files are kept.
+        """
+        if name := next((one for one in self.names if one in kept), ""):
+            return name
+        try:
+            return self.find(manager).name
+        except DoraSystemdError as error:
+            if error.code is ExitCode.NOT_FOUND and (ended := self.ended(scope)):
+                return ended.name
+            raise
 
     def _recorded(self, scope: Scope) -> "DataflowRow | None":
         """Find an ended dataflow as ended() does; None also if the journal cannot be read."""

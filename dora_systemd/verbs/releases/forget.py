@@ -39,7 +39,7 @@ def find_kept(manager: Manager, scope: Scope, selector: str) -> Kept:
 
     Raises DoraSystemdError: NOT_FOUND; NAME_IN_USE while the dataflow runs or is enabled.
     """
-    name = _name(manager, scope, selector)
+    name = Selector(selector).find_name(manager, scope, deployed_names(scope))
     store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
     _require_unused(standing, name)
     uuid = standing.uuid or _uuid_of(store)
@@ -73,7 +73,7 @@ def remove_releases(
     Raises DoraSystemdError: NOT_FOUND; NAME_IN_USE for the present one and one on trial. Nothing is
     removed then.
     """
-    name = _name(manager, scope, selector)
+    name = Selector(selector).find_name(manager, scope, deployed_names(scope))
     store = store_of(scope, name)
     if not is_directory(store.path):
         hint = f"doractl deploy --name {name} makes the first one"
@@ -88,19 +88,6 @@ def remove_releases(
             store.remove(release)
             note_removal(store, standing, release, _COMMAND)
             yield kept, release
-
-
-def _name(manager: Manager, scope: Scope, selector: str) -> str:
-    """The name of the dataflow that is meant: one with releases, that systemd knows, or ended."""
-    wanted, deployed = Selector(selector), deployed_names(scope)
-    if name := next((one for one in wanted.names if one in deployed), ""):
-        return name
-    try:
-        return wanted.find(manager).name
-    except DoraSystemdError as error:
-        if error.code is ExitCode.NOT_FOUND and (ended := wanted.ended(scope)):
-            return ended.name
-        raise
 
 
 def _require_unused(standing: Standing, name: str) -> None:
