@@ -67,7 +67,7 @@ class Episode(NamedTuple):
 
 
 def write_project(project: Project) -> Path:
-    """The example, slower, with its virtual environment beside it; its dataflow file."""
+    """Copy the example with lower rates, and link the venv; returns the path of the dataflow."""
     for place in (CHECKOUT / "examples/openarm").iterdir():
         project.write(place.name, place.read_text())
     flow = project.root / "dataflow.yml"

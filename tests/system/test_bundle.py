@@ -41,7 +41,7 @@ SECRETS = {
     "the text of the unit": "planted-unit-8e9c",
     "settings": "planted-settings-9ab4",
 }
-"""The eleventh is the token of the coordinator, which each life makes anew."""
+"""The eleventh secret, the token of the coordinator, is new in each life."""
 LOGGED = "planted-logged-af3e"
 
 

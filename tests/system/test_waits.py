@@ -1,4 +1,4 @@
-"""Who has the CPUs of a node: a busy process on the same one, and the interrupts of its device."""
+"""What uses the CPUs of a node: busy processes, and the interrupts of a device that it needs."""
 
 import json
 import os

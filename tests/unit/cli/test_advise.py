@@ -61,7 +61,7 @@ def records(count: int = 3) -> list[dict[str, object]]:
 
 
 class Place:
-    """A dataflow file, with a settings file beside it, and a journal with its lives."""
+    """Write a dataflow file and its settings file, and a journal with lives of the dataflow."""
 
     def __init__(self, patch: pytest.MonkeyPatch, root: Path) -> None:
         self.journal = FakeJournal(patch, root)
