@@ -30,6 +30,10 @@ IN_CONTAINER = "not vm and not emulator and not openarm"
 # Containers at the same time. Most of the time of a test is waiting, and one more than three makes
 # two cores so busy that the tests wait for each other.
 CONTAINERS = 3
+# A step that takes so many times longer than it should hangs: it fails, and the others are shown.
+# A machine may have half of the speed, and images are built in the minutes of the first that asks.
+PATIENCE = 5
+LEAST_LONGEST = 20
 # Unit tests that need mandoc, fish or zsh, which the lab has.
 WITH_TOOLS = (
     "tests/unit/cli/test_completions.py",
@@ -75,7 +79,8 @@ def plan_test(form: str) -> list[Step]:
     others = [*plan_lab(form), *plan_other_python(form), *plan_emulator(form)]
     lane = [build, packages_step(), wheels_step(), oldest, newest, *others]
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
-    return [unit, *several, *in_a_row(lane, unit), inside, restarted, arm, *queue]
+    plan = [unit, *several, *in_a_row(lane, unit), inside, restarted, arm, *queue]
+    return [replace(one, longest=max(LEAST_LONGEST, PATIENCE * one.minutes)) for one in plan]
 
 
 def in_a_row(steps: Sequence[Step], first: Step) -> list[Step]:

@@ -39,6 +39,8 @@ class Step:
     # About, on two cores that have nothing else to do; 0 for less than half a minute.
     minutes: int = 0
     after: tuple[str, ...] | None = None
+    # Minutes after which it is ended, because a machine in it hangs; 0: never.
+    longest: float = 0
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,9 @@ class Running:
             self._has_ended.set()
 
     def _call(self) -> int:
-        command = die_with_parent(self.step.command, "TERM")
+        limit = ["timeout", "--foreground", "--kill-after=1m", f"{self.step.longest}m"]
+        words = [*limit, *self.step.command] if self.step.longest else self.step.command
+        command = die_with_parent(words, "TERM")
         env = self.step.env()
         process = subprocess.Popen(command, env=env, cwd=self.step.cwd, stdout=self._output)
         _, status, usage = os.wait4(process.pid, 0)

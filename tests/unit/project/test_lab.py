@@ -256,6 +256,15 @@ def test_a_step_ends_with_the_command_that_has_begun_it() -> None:
         assert child.stderr.read().startswith(b"lab: --- step 1 of 1")
 
 
+def test_a_step_that_hangs_is_ended(capfd: pytest.CaptureFixture[str]) -> None:
+    hangs = Step("hangs", ["sh", "-c", "exec sleep 1000"], os.environ.copy, longest=0.005)
+    assert run_steps([hangs, Step("next", ["true"], os.environ.copy)]) == 124
+    said = capfd.readouterr().err
+    assert "hangs: FAILED with exit status 124" in said
+    assert "next: ok" in said
+    assert all(step.longest >= 20 for step in PLANS["test"]("container"))
+
+
 def test_bounds_are_in_seconds_of_an_idle_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pace.measure() >= 1
     monkeypatch.setattr(pace, "_last", (time.monotonic(), 2.5))
