@@ -15,10 +15,13 @@ from pathlib import Path
 from lab.cache import find_cache, take_lock, try_lock
 from lab.errors import LabError
 from lab.pace import bound
+from lab.process import read_last_line
 
 RUNS = Path("/run/dora-systemd-lab")
 CONSOLE = "console"
 """The file of a run with what a machine prints on its console."""
+LOG = "log"
+"""The file of a run with what the machine's emulator prints."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +54,17 @@ def open_run() -> Run:
 
 
 def with_console(error: LabError, run: Run) -> LabError:
-    """The error of a machine, with what its console has said kept beside the images."""
+    """The error of a machine, with the last words of its emulator, if it has said any.
+
+    What the machine has said on its console is kept beside the images.
+    """
     kept = find_cache() / "console.log"
     with suppress(FileNotFoundError):
         shutil.copy(run.directory / CONSOLE, kept)
-    return LabError(error.message, error.hint or f"see {kept}")
+    log = run.directory / LOG
+    last = read_last_line(log) if log.exists() else ""
+    said = f": {last}" if last not in error.message else ""
+    return LabError(f"{error.message}{said}", error.hint or f"see {kept}")
 
 
 class Guard:
