@@ -67,12 +67,17 @@ def heard() -> str:
     return there(HEAD, f"journalctl -q -n 1 -o short-unix -t {NAME}/sink").stdout
 
 
+def runs() -> bool:
+    """A node may receive a message before the head knows that all nodes are open."""
+    row = json.loads(head("list", NAME, "-o", "json").stdout)
+    return {node["state"] for node in row["nodes"]} == {"running"}
+
+
 def runs_once() -> None:
     """Return when messages flow between the machines; each process is there once, in its unit."""
     before = heard()
     wait_for("the sink hears more", lambda: heard() not in ("", before), 60)
-    row = json.loads(head("list", NAME, "-o", "json").stdout)
-    assert {node["state"] for node in row["nodes"]} == {"running"}
+    wait_for("all nodes run", runs, 60)
     flow = Flow({"gpu": MEMBER})
     for machine, patterns in PROCESSES.items():
         for pattern in patterns:

@@ -35,19 +35,9 @@ for event in Node():
 @contextmanager
 def burners(count: int) -> Iterator[set[int]]:
     """Processes that want all of the last CPU."""
-    # With equal shares the average of a minute takes more than a minute to become 20 %.
-    command = [
-        "nice",
-        "-n",
-        "-15",
-        "taskset",
-        "--cpu-list",
-        str(LAST),
-        sys.executable,
-        "-c",
-        "while True: pass",
-    ]
+    command = ["taskset", "--cpu-list", str(LAST), sys.executable, "-c", "while True: pass"]
     with ExitStack() as stack:
+        # The kernel shares the time of a CPU among sessions: each of them has one of its own.
         found = [
             stack.enter_context(subprocess.Popen(command, start_new_session=True))
             for _ in range(count)
