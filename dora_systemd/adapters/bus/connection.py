@@ -25,6 +25,8 @@ READ_SECONDS = 5.0
 """Timeout for an answer on a connection that only reads."""
 CALL_SECONDS = 25.0
 """Timeout for any other answer, as in systemctl: systemd may be reloading all units."""
+RELOAD_SECONDS = 180.0
+"""Timeout for a reload, as in systemctl: generators run, and each of them may take 90 s."""
 _BUS_SECONDS = 1.0
 """Timeout for the first message from the message bus, if there is another way."""
 _TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
@@ -38,10 +40,13 @@ _CLOSE = (-1, None)
 """pystemd's mark for the end of a container."""
 
 
-def connect(scope: Scope, for_reading: bool) -> Any:
-    """A pystemd connection to the manager of `scope`. Raises DoraSystemdError (NO_SYSTEMD)."""
+def connect(scope: Scope, for_reading: bool, seconds: float = 0) -> Any:
+    """A pystemd connection to the manager of `scope`, with `seconds` for each answer if not 0.
+
+    Raises DoraSystemdError (NO_SYSTEMD).
+    """
     address, private = _address(scope), _private_socket(scope)
-    seconds = READ_SECONDS if for_reading else CALL_SECONDS
+    seconds = seconds or (READ_SECONDS if for_reading else CALL_SECONDS)
     # Only root may use the system manager's private socket. It is the second choice: systemd takes
     # some milliseconds for each connection to it, and it is only on the bus that systemd notices
     # when a client disconnects, which hold() needs.

@@ -20,6 +20,7 @@ from typing import Any
 
 from dora_systemd.adapters.bus.connection import (
     MANAGER_OBJECT,
+    RELOAD_SECONDS,
     SERVICE,
     connect,
     decoded,
@@ -63,11 +64,12 @@ class Bus:
 
     for_reading: the caller changes nothing. Then each answer may take READ_SECONDS, and the private
     socket of systemd takes the place of a message bus that does not answer; see connection.py.
+    seconds: timeout for each answer; 0 for the usual one.
     """
 
-    def __init__(self, scope: Scope, for_reading: bool = False) -> None:
+    def __init__(self, scope: Scope, for_reading: bool = False, seconds: float = 0) -> None:
         self.scope = scope
-        self._bus = connect(scope, for_reading)
+        self._bus = connect(scope, for_reading, seconds)
         self._matches: dict[bytes, Callable[..., None]] = {}
 
     def __del__(self) -> None:
@@ -166,7 +168,8 @@ class Bus:
         return str(self._get("read systemd's cgroup", "ControlGroup"))
 
     def reload(self) -> None:
-        self._call("reload systemd", "Reload")
+        # The timeout belongs to the connection.
+        Bus(self.scope, seconds=RELOAD_SECONDS)._call("reload systemd", "Reload")
 
     def unit_path(self) -> list[str]:
         return list(self._get("read where units are", "UnitPath"))

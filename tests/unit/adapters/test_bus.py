@@ -267,3 +267,10 @@ def test_a_systemd_that_accepts_and_does_not_answer_costs_no_descriptor(
     with pytest.raises(DoraSystemdError, match=r"^cannot reach systemd: Connection timed out$"):
         connection._open(SYSTEM, "/nowhere/private", 5.0, 1.0)
     assert not systemd.connections
+
+
+def test_a_reload_may_take_as_long_as_generators(monkeypatch: pytest.MonkeyPatch) -> None:
+    systemd = fake_systemd(monkeypatch, manager := FakeManager())
+    bus.Bus(SYSTEM).reload()
+    assert systemd.timeouts == ["25s", "180s"]
+    assert [call[0] for call in manager.calls] == ["reload"]

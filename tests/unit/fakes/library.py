@@ -86,6 +86,8 @@ class FakeSystemd:
             self.manager.reset_failed(words[0])
         if method == "RefUnit":
             self.manager.hold(words[0])
+        if method == "Reload":
+            self.manager.reload()
         return None
 
     def _get(self, part: str, name: str) -> Any:
