@@ -39,7 +39,7 @@ class Guest:
         self.send(b"R", json.dumps(body).encode())
 
     def send(self, kind: bytes, body: bytes = b"") -> None:
-        with contextlib.suppress(BrokenPipeError):  # told by the reader, better
+        with contextlib.suppress(ConnectionError):  # told by the reader, better
             self.port.sendall(pack_frame(kind, body))
 
     def send_pieces(self, descriptor: int) -> None:

@@ -21,6 +21,10 @@ KERNEL_OPTIONS = (
 )
 
 
+# A machine with a kernel in user mode locks the whole image below, which nobody writes to.
+UNLOCKED = "backing.file.locking=off"
+
+
 def machine_command(
     emulator: Path, layer: Path, disk: Path, place: Path, snapshot: str, memory: str
 ) -> list[str]:
@@ -32,7 +36,7 @@ def machine_command(
         "-smp", "2", "-m", memory, "-nodefaults", "-no-user-config", "-display", "none",
         "-kernel", str(layer / "vmlinuz"), "-initrd", str(layer / "initrd"),
         "-append", KERNEL_OPTIONS,
-        "-drive", f"file={disk},if=none,id=disk,format=qcow2,cache=unsafe",
+        "-drive", f"file={disk},if=none,id=disk,format=qcow2,cache=unsafe,{UNLOCKED}",
         "-device", "virtio-blk-pci,drive=disk",
         "-device", "virtio-serial-pci",
         "-chardev", f"socket,id=agent,path={place / 'agent'},server=on,wait=on",

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -123,14 +124,26 @@ def test_random_numbers_differ(env: dict[str, str]) -> None:
     assert len({*first, *second}) == 4
 
 
+@contextmanager
+def other_machine() -> Iterator[None]:
+    """One with a kernel in user mode, which uses the same image."""
+    command = [str(LAB), "run", "--", "sh", "-c", "echo up; cat"]
+    env, pipe = {**os.environ, "LAB": "vm"}, subprocess.PIPE
+    with subprocess.Popen(command, env=env, stdin=pipe, stdout=pipe) as other:
+        assert other.stdout and other.stdout.readline() == b"up\n"
+        yield
+        other.communicate(b"")
+
+
 def test_the_emulator_takes_and_gives(tmp_path: Path) -> None:
     env = {**os.environ, "LAB": "emulator", "LAB_OUT": str(tmp_path)}
     script = "ls /src/pyproject.toml; cat; nproc > /out/processors; exit 3"
-    assert lab(env, "run", "--", "sh", "-c", script, given=b"in") == (
-        3,
-        b"/src/pyproject.toml\nin",
-        b"",
-    )
+    with other_machine():
+        assert lab(env, "run", "--", "sh", "-c", script, given=b"in") == (
+            3,
+            b"/src/pyproject.toml\nin",
+            b"",
+        )
     assert (tmp_path / "processors").read_text() == "2\n"
     assert_nothing_left()
 
