@@ -101,6 +101,14 @@ bench-quick:  ## a few benchmarks in 3 minutes, their ratios beside the stored o
 	@$(PREPARE) container
 	@LAB=rivals tests/lab/lab run -- python -m benchmarks.quick $(WHAT)
 
+bench-platforms:  ## list and start of the packages on Debian 12, 13 and the next one, beside dora; ROUNDS=n
+	@$(PREPARE) container
+	@packaging/build --once
+	@for one in bookworm container forky; do \
+	    LAB=$$one LAB_OUT=benchmarks/data tests/lab/lab run -- \
+	        tests/platforms/installed python -m benchmarks.platforms $(ROUNDS) || exit; done
+	@/usr/bin/python3 -B -m benchmarks.report
+
 bookworm:  ## the packages on Debian 12, with systemd 252, installed by apt, and wheels by uv
 	@$(PREPARE) container
 	@$(CHECK) bookworm
@@ -136,4 +144,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm emulator faults history stops power fuzz mutants browser openarm machines bench bench-quick bookworm forky canary lint demo clean deb wheels autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm emulator faults history stops power fuzz mutants browser openarm machines bench bench-quick bench-platforms bookworm forky canary lint demo clean deb wheels autopkgtest

@@ -32,6 +32,9 @@ TITLES = {
     "owes": "Owed outputs",
     "machines": "Between machines",
     "spread": "Start over two machines",
+    "platform-bookworm": "The packages on Debian 12",
+    "platform-container": "The packages on Debian 13",
+    "platform-forky": "The packages on the next Debian",
 }
 """The records in their order."""
 
