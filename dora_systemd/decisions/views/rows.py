@@ -59,6 +59,7 @@ class DataflowRow(NamedTuple):
     machine: str = ""  # the name of this machine if the head is elsewhere, or ""
     runner_version: str = ""  # of dora-systemd when it was started, "" if that is not known
     options_problem: str = ""  # why this doractl does not know all its options, or ""
+    is_up: bool = True  # whether systemd has begun its start, or has the start in its queue
 
     @property
     def release(self) -> str:
@@ -71,7 +72,8 @@ class DataflowRow(NamedTuple):
         if self.options_problem:
             # A restart would start the same command line, which the installed runner refuses.
             flag = "--enable " if self.enabled else ""
-            todo = f"doractl stop {self.name}, then doractl start {flag}{self.dataflow}"
+            todo = f"doractl start {flag}--name {self.name} {self.dataflow}"
+            todo = f"doractl stop {self.name}, then {todo}" if self.is_up else todo
             todo = "deploy its project again" if self.release else todo
             return f"another version has started it: {self.options_problem}", todo
         if self.runner_version in ("", __version__):

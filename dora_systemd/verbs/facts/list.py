@@ -57,6 +57,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "problem": reading.problem,
         "runner_version": status.version if status.uuid else "",
         "options_problem": cell.options_problem,
+        "is_up": cell.is_up,
         **_machines(cell),
     }
     if held := reading.held:

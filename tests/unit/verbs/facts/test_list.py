@@ -95,6 +95,10 @@ def test_a_dataflow_of_another_version_says_so(scope: Scope) -> None:
     (cell,) = read_cells(manager)
     (outcome,) = stop_cells(manager, scope, [cell])
     assert outcome.text == f"Dataflow stopped: {UUID} (robot)"
+    manager.units[unit] |= {"ActiveState": "inactive", "SubState": "dead"}
+    assert (row.is_up, row_of(manager, scope).is_up) == (True, False)
+    _, todo = row._replace(is_up=False, enabled=True).upgrade
+    assert todo == f"doractl start --enable --name robot {row.dataflow}", "there is nothing to stop"
 
 
 @pytest.mark.parametrize(
