@@ -1,11 +1,14 @@
-"""The Debian packages agree with the project and with themselves."""
+"""The Debian packages, and the workflow of a release, agree with the project."""
 
 import re
 import subprocess
 import tomllib
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from dora_systemd import __version__
 from dora_systemd.adapters.releases.store import store_root
@@ -13,6 +16,7 @@ from dora_systemd.decisions.unit.file import HEADER
 from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION
 from dora_systemd.names import SLICE
 from dora_systemd.verbs.start.where import DEFAULT_USER
+from tests.lab.definition import OLD_SUITE
 from tests.unit.checkout import CHECKOUT
 
 PACKAGING = CHECKOUT / "packaging"
@@ -23,6 +27,15 @@ UNITS = sorted(
     for path in TEMPLATES.iterdir()
     if path.suffix in (".slice", ".target", ".socket", ".service")
 )
+JOBS: dict[str, dict[str, Any]] = yaml.safe_load(
+    (CHECKOUT / ".github/workflows/release.yml").read_text()
+)["jobs"]
+MATRIX = JOBS["wheels"]["strategy"]["matrix"]
+"""The Pythons, and the machines, one for each processor."""
+PROCESSORS = {"ubuntu-24.04": "x86_64", "ubuntu-24.04-arm": "aarch64"}
+COMPILED = ("pystemd", "systemd-python")
+"""PyPI has no wheels of these."""
+RELEASED = ("dora-systemd_0.1.0_all.deb", "dora-cli_1_amd64.deb", "dora-cli_1_arm64.deb")
 
 
 def version_of(debian: Path) -> str:
@@ -168,3 +181,71 @@ def test_purge_takes_what_enable_has_written(tmp_path: Path) -> None:
     left = [path for path in tmp_path.rglob("*") if not path.is_dir() or path.is_symlink()]
     assert sorted(left) == sorted(others)
     assert not (etc / "dora.target.wants").exists()
+
+
+def step_of(job: str, words: str) -> dict[str, Any]:
+    """The step that runs a command that begins with these words, or uses this action."""
+    (step,) = [
+        one for one in JOBS[job]["steps"] if (one.get("run") or one["uses"]).startswith(words)
+    ]
+    return dict(step)
+
+
+def test_wheels_for_each_python_and_processor() -> None:
+    assert MATRIX["python"] == ["3.11", "3.12", "3.13", "3.14"]
+    assert MATRIX["runner"] == [*PROCESSORS]
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    assert project["requires-python"] == f">={MATRIX['python'][0]}"
+    assert JOBS["wheels"]["runs-on"] == "${{ matrix.runner }}"
+    image = f"python:${{{{ matrix.python }}}}-{OLD_SUITE}"
+    assert JOBS["wheels"]["container"] == image, "libsystemd and glibc of the oldest system"
+    assert {".", *COMPILED} <= {*step_of("wheels", "pip wheel")["run"].split()}
+
+
+def test_the_packages_are_those_of_make_deb() -> None:
+    assert step_of("packages", "make")["run"] == "make deb"
+    assert re.search(r"^deb:", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
+
+
+def built_wheels(place: Path, python: str, runner: str) -> list[Path]:
+    """What the job for one Python uploads, of wheels that are empty files."""
+    number = python.replace(".", "")
+    compiled = f"cp{number}-cp{number}-linux_{PROCESSORS[runner]}.whl"
+    (wheels := place / "wheels").mkdir(parents=True)
+    (wheels / "dora_systemd-0.1.0-py3-none-any.whl").touch()
+    for name in COMPILED:
+        (wheels / f"{name.replace('-', '_')}-1-{compiled}").touch()
+    remove = step_of("wheels", "rm ")
+    assert remove["if"] == "matrix.python != '3.11' || matrix.runner != 'ubuntu-24.04'"
+    if (python, runner) != ("3.11", "ubuntu-24.04"):
+        subprocess.run(["sh", "-euc", remove["run"]], cwd=place, check=True)
+    return list(place.glob(step_of("wheels", "actions/upload")["with"]["path"]))
+
+
+def test_a_release_has_each_file_once_and_its_checksum(tmp_path: Path) -> None:
+    (dist := tmp_path / "dist").mkdir()
+    for python, runner in product(MATRIX["python"], MATRIX["runner"]):
+        for wheel in built_wheels(tmp_path / python / runner, python, runner):
+            assert not (dist / wheel.name).exists(), "one of another job"
+            wheel.rename(dist / wheel.name)
+    for name in RELEASED:
+        (dist / name).touch()
+    assert len([*dist.glob("*.whl")]) == 1 + len(COMPILED) * 4 * 2
+    sums = step_of("release", "cd dist")["run"]
+    subprocess.run(["sh", "-euc", sums], cwd=tmp_path, check=True)
+    check = ["sha256sum", "--check", "--strict", "--quiet", "SHA256SUMS"]
+    subprocess.run(check, cwd=dist, check=True)
+    lines = (dist / "SHA256SUMS").read_text().splitlines()
+    assert {line.split()[1] for line in lines} == {path.name for path in dist.glob("*[bl]")}
+
+
+def test_only_a_tag_makes_a_release_and_only_of_all_jobs() -> None:
+    release = JOBS["release"]
+    assert release["if"] == "github.ref_type == 'tag'"
+    assert set(release["needs"]) == {*JOBS} - {"release"}
+    assert release["permissions"] == {"contents": "write"}
+    download = step_of("release", "actions/download")["with"]
+    assert download == {"path": "dist", "merge-multiple": True}
+    names = [step_of(job, "actions/upload")["with"]["name"] for job in release["needs"]]
+    assert names == ["wheels-${{ matrix.python }}-${{ matrix.runner }}", "packages"]
+    assert step_of("release", "gh release create")["run"].endswith(" dist/*")
