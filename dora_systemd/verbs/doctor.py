@@ -29,6 +29,7 @@ from dora_systemd.decisions.views.diagnosis import (
     DORA_PORTS,
     Process,
     judge_controllers,
+    judge_huge_pages,
     judge_port,
     judge_processes,
     judge_rate,
@@ -291,6 +292,12 @@ def _pressure(_scope: Scope, root: Path) -> Iterator[Finding]:
         yield Finding("pressure", State.NOTE, text, "boot with psi=1")
 
 
+def _huge_pages(_scope: Scope, root: Path) -> Iterator[Finding]:
+    with suppress(OSError):
+        mounts = (root / "proc/self/mounts").read_text(errors="replace")
+        yield from judge_huge_pages(mounts, (root / "proc/sys/vm/nr_hugepages").read_text())
+
+
 def _interrupts(manager: Manager, _scope: Scope, root: Path) -> Iterator[Finding]:
     """Compare the CPUs of nodes with those that handle the interrupts of their devices."""
     interrupts = Interrupts(root)
@@ -366,5 +373,5 @@ def _below(root: Path, path: Path) -> Path:
 
 _OF_DATAFLOWS = (_units, _leftovers, _ports, _releases, _versions, _interrupts)
 _WITH_SYSTEMD = (_controllers, _linger, _boot, *_OF_DATAFLOWS)
-_OF_MACHINE = (_processes, _real_time, _pressure, _coredumps, _upgrades)
+_OF_MACHINE = (_processes, _real_time, _pressure, _huge_pages, _coredumps, _upgrades)
 _WITHOUT = (_dora, _user, _logins, _settings, *_OF_MACHINE)

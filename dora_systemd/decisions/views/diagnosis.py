@@ -21,6 +21,7 @@ DORA_PORTS = {
 _CELL = re.compile(r"/dora-[^/]+\.service(/|$)")
 _ENGINES = ("coordinator", "daemon")
 _MAX_COMMAND = 80
+_COUNTS_HUGE_PAGES = "memory_hugetlb_accounting"
 _RATE_DEFAULTS = {"RateLimitIntervalSec": "30s", "RateLimitBurst": "10000"}
 
 
@@ -80,6 +81,19 @@ def judge_controllers(available: Collection[str], is_user: bool) -> Finding:
     # The admin decides what a user's manager gets; without I/O is the default of distributions.
     state = State.NOTE if is_user and missing == [CONTROLLERS["io"]] else State.WARNING
     return Finding("cgroup", state, text, remedy)
+
+
+def judge_huge_pages(mounts: str, reserved: str) -> Iterator[Finding]:
+    """Report that huge pages count against memory limits, as they do since systemd 259.
+
+    mounts: the content of /proc/self/mounts. reserved: that of /proc/sys/vm/nr_hugepages.
+    """
+    table = [line.split() for line in mounts.splitlines()]
+    options = [words[3].split(",") for words in table if words[2:3] == ["cgroup2"]]
+    if reserved.strip() not in ("", "0") and any(_COUNTS_HUGE_PAGES in one for one in options):
+        text = "huge pages count against memory limits here, not with systemd before 259"
+        remedy = "raise the memory limits of nodes that use huge pages"
+        yield Finding("huge pages", State.NOTE, text, remedy)
 
 
 def judge_rate(config: str, is_user: bool) -> Finding:

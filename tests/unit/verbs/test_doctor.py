@@ -143,6 +143,27 @@ def test_what_others_have_set_up(manager: FakeManager, scope: Scope, tmp_path: P
     assert findings["upgrades"].state is State.WARNING
 
 
+@pytest.mark.parametrize(
+    ("option", "reserved", "is_noted"),
+    [("memory_hugetlb_accounting", "8", True), ("memory_hugetlb_accounting", "0", False),
+     ("memory_recursiveprot", "8", False)],
+)  # fmt: skip
+def test_huge_pages(
+    manager: FakeManager, scope: Scope, tmp_path: Path, option: str, reserved: str, is_noted: bool
+) -> None:
+    """systemd 259 and newer mount the hierarchy so that they count against MemoryMax=."""
+    for name, text in {
+        "proc/self/mounts": f"cgroup2 /sys/fs/cgroup cgroup2 rw,nsdelegate,{option} 0 0\n\n",
+        "proc/sys/vm/nr_hugepages": f"{reserved}\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    findings = found(manager, scope)
+    assert ("huge pages" in findings) is is_noted
+    if is_noted:
+        assert "memory limits" in findings["huge pages"].remedy
+
+
 def test_core_dumps_of_a_machine(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
     config = tmp_path / "bin/systemd-analyze"
     make_program(config, "echo ProcessSizeMax=0")
