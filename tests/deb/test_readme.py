@@ -12,6 +12,7 @@ import pytest
 
 from tests.deb import packages
 from tests.deb.packages import sh
+from tests.deb.typed_pages import FROM_NOTHING, WITH_ROBOT
 from tests.system.ports import reserve_ports
 from tests.system.typed import Shell, Typed, as_text, type_line, typed_lines
 
@@ -19,15 +20,6 @@ NO_MEMORY = not Path("/sys/fs/cgroup/cgroup.controllers").read_text().count("mem
 """Containers whose kernel has memory in cgroup v1 refuse a limit, as doractl should."""
 KEYS = {"doractl top": ("plot", b"q"), "doractl run": ("frame ", b"\x03")}
 """Commands that wait for a key: when to press it, and which."""
-FROM_NOTHING = ("README.md", "docs/first-steps.md", "docs/robot-arm.md")
-WITH_ROBOT = tuple(
-    f"docs/{name}.md"
-    for name in (
-        *("run-at-boot", "logs", "sandbox", "releases", "monitoring", "production"),
-        "coming-from",
-    )
-)
-"""Pages about a robot that is already in PLACE."""
 PLACE, ARM = Path("/srv/robot"), Path("/srv/arm")
 LEFT = "/srv/records /etc/systemd/system/notify.service"
 """What pages make elsewhere."""

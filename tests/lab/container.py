@@ -7,7 +7,7 @@ import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lab import cgroup, image
@@ -16,7 +16,7 @@ from lab.cache import find_cache
 from lab.errors import LabError
 from lab.options import Options
 from lab.pace import bound
-from lab.process import die_with_parent, need_tools, read_last_line
+from lab.process import die_with_parent, need_tools, read_last_line, run_logged
 from lab.runs import Run, note, remove_cgroup
 from lab.service import service_command
 from lab.terminal import is_terminal, kept_terminal
@@ -34,11 +34,19 @@ class Container:
 
 def run_in_container(run: Run, tree: Path, options: Options) -> int:
     need_tools("systemd-nspawn")
-    if len(options.commands) > 1:
-        raise LabError("reboot a container", "LAB=vm")
     place_checkout(run.directory / "src")
-    with started_container(run, tree, options.out) as container, kept_terminal():
-        return subprocess.run(enter_command(container, options), check=False).returncode
+    hide_traces(run)
+    disk = insert_disk(run.directory, tree) if len(options.commands) > 1 else None
+    status = 0
+    for number, command in enumerate(options.commands):
+        with started_container(run, tree, options.out, disk) as container, kept_terminal():
+            words = enter_command(container, replace(options, commands=(command,)))
+            status = subprocess.run(words, check=False).returncode
+            if status:
+                break
+            if number < len(options.commands) - 1:
+                shut_down(container, run.directory / "shutdown.log")
+    return status
 
 
 def place_checkout(source: Path) -> None:
@@ -49,14 +57,28 @@ def place_checkout(source: Path) -> None:
     subprocess.run([*unpack, f"--directory={source}"], check=True)
 
 
+def insert_disk(place: Path, tree: Path) -> Path:
+    """The image as a disk that outlives a boot; what is written to it is below `place`."""
+    root, upper, work = (place / name for name in ("root", "upper", "work"))
+    for directory in (root, upper, work):
+        directory.mkdir(mode=0o755, parents=True)
+    options = f"lowerdir={tree},upperdir={upper},workdir={work}"
+    command = ["mount", "-t", "overlay", place.name, "-o", options, str(root)]
+    run_logged(command, place / "disk.log", "mount a disk")
+    return root
+
+
 @contextmanager
-def started_container(run: Run, tree: Path, out: Path | None) -> Iterator[Container]:
-    hide_traces(run)
+def started_container(
+    run: Run, tree: Path, out: Path | None, disk: Path | None
+) -> Iterator[Container]:
     enter, path = cgroup.enter_command(run.name)
     note(run, "cgroup", path)
     ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    ready.bind(str(run.directory / "notify"))
-    nspawn = start_nspawn(run, [*enter, *nspawn_command(run, tree, out)])
+    told = run.directory / "notify"
+    told.unlink(missing_ok=True)
+    ready.bind(str(told))
+    nspawn = start_nspawn(run, [*enter, *nspawn_command(run, tree, out, disk)])
     try:
         # Closed then: in a socket that nobody reads nspawn would wait, and PID 1 for nspawn.
         with ready:
@@ -92,9 +114,9 @@ def start_nspawn(run: Run, command: list[str]) -> subprocess.Popen[bytes]:
         )
 
 
-def nspawn_command(run: Run, tree: Path, out: Path | None) -> list[str]:
+def nspawn_command(run: Run, tree: Path, out: Path | None, disk: Path | None) -> list[str]:
     return die_with_parent([
-        *nspawn_words(run, tree, "lab"), "--volatile=overlay",
+        *nspawn_words(run, disk or tree, "lab"), *([] if disk else ["--volatile=overlay"]),
         f"--bind={run.directory / 'src'}:/src", *([f"--bind={out}:/out"] if out else []),
     ])  # fmt: skip
 
@@ -136,5 +158,21 @@ def wait_ready(
 def enter_command(container: Container, options: Options) -> list[str]:
     """In the run's cgroup as well: whatever ends that ends this too, before it can complain."""
     join = cgroup.join_command(container.supervisor)
-    nsenter = ["nsenter", f"--target={container.leader}", "--all", "--"]
-    return [*join, *nsenter, *service_command(options.commands[0], options, is_terminal())]
+    command = service_command(options.commands[0], options, is_terminal())
+    return [*join, *nsenter_words(container), *command]
+
+
+def nsenter_words(container: Container) -> list[str]:
+    return ["nsenter", f"--target={container.leader}", "--all", "--"]
+
+
+def shut_down(container: Container, log: Path) -> None:
+    """Its systemd stops everything, as before a reboot of a machine."""
+    ended = os.pidfd_open(container.leader)
+    try:
+        command = [*nsenter_words(container), "systemctl", "poweroff"]
+        run_logged(command, log, "shut down the container")
+        if not select.select([ended], [], [], bound(BOOT_SECONDS))[0]:
+            raise LabError("shut down the container", "does a unit take too long to stop?")
+    finally:
+        os.close(ended)

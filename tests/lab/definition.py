@@ -40,8 +40,8 @@ PLATFORM_PACKAGES = [
 ]  # fmt: skip
 # Programs that its tests run.
 TOOLS = [
-    "bash-completion", "curl", "fish", "git", "kmod", "less", "lsof", "man-db", "mandoc", "psmisc",
-    "rsync", "socat", "strace", "tmux", "udev", "zsh",
+    "bash-completion", "curl", "fish", "git", "kmod", "less", "lsof", "man-db", "mandoc", "pipx",
+    "psmisc", "rsync", "socat", "strace", "tmux", "udev", "zsh",
 ]  # fmt: skip
 
 # The oldest Debian that the product works on, and the next one, which is not released yet.

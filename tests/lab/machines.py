@@ -23,6 +23,7 @@ from lab.container import (
     Container,
     enter_command,
     hide_traces,
+    insert_disk,
     nspawn_words,
     place_checkout,
     start_nspawn,
@@ -69,7 +70,7 @@ SetEnv PATH=/opt/lab/bin:/usr/bin:/bin
 def run_in_machines(run: Run, tree: Path, options: Options) -> int:
     need_tools("systemd-nspawn", "ip")
     if len(options.commands) > 1:
-        raise LabError("reboot a container", "LAB=vm")
+        raise LabError("reboot three machines at once", "power, see tests/machines/wires.py")
     hide_traces(run)
     place_checkout(run.directory / "src")
     with built(run, tree, options.out) as machines, kept_terminal():
@@ -121,12 +122,6 @@ class Machine:
     def cable(self) -> str:
         return f"cable-{self.name}"
 
-    def insert_disk(self, tree: Path) -> None:
-        """Give it a disk with the image on it."""
-        lower, upper, work = tree, made(self.place / "upper"), made(self.place / "work")
-        options = f"lowerdir={lower},upperdir={upper},workdir={work}"
-        call(["mount", "-t", "overlay", self.run.name, "-o", options, str(made(self.root))])
-
     def power_on(self) -> None:
         inner = Run(self.place, self.run.lock)
         enter, path = cgroup.enter_command(inner.name)
@@ -166,7 +161,7 @@ def furnish(machines: dict[str, Machine], tree: Path) -> None:
     """Disks, addresses, and root of the first as root and alice of all, by ssh."""
     hosts = [f"{address(number)} {name}" for number, name in enumerate(machines)]
     for number, one in enumerate(machines.values()):
-        one.insert_disk(tree)
+        insert_disk(one.place, tree)
         etc = one.root / "etc"
         (etc / "hostname").write_text(f"{one.name}\n")
         (etc / "hosts").write_text("\n".join(["127.0.0.1 localhost", "::1 localhost", *hosts, ""]))

@@ -36,7 +36,7 @@ environment:
 The command runs as root in a private copy of the checkout, /src; what it writes
 there is gone afterwards. Inside, LAB names the form. The exit status is the
 command's, 128+N if signal N killed it, 125 if the lab itself failed.
-With LAB=vm or emulator, CMD1 --reboot-- CMD2 restarts the machine in between, if CMD1 succeeds.
+CMD1 --reboot-- CMD2 restarts the system in between, if CMD1 succeeds; not with LAB=machines.
 """
 
 
@@ -44,7 +44,7 @@ With LAB=vm or emulator, CMD1 --reboot-- CMD2 restarts the machine in between, i
 class Options:
     verb: str
     form: str
-    # More than one only in a machine, which is rebooted between them.
+    # Between two of them the system is rebooted.
     commands: tuple[tuple[str, ...], ...] = ()
     env: tuple[tuple[str, str], ...] = ()
     out: Path | None = None

@@ -43,7 +43,7 @@ WITH_TOOLS = (
 # Stops between two restarts of a machine, which come after other kinds of stops each time.
 STAGE = 9
 # What `make test` runs on the next Debian: what differs there.
-NEW = "versions or doctor or units or life or newer or account or ordinary"
+NEW = "versions or doctor or units or life or newer or account or ordinary or pipx"
 # Far more than any test takes: one that hangs fails and shows where, and the others run.
 PYTEST = ("pytest", "--timeout=900")
 # A dataflow as a service, from start to stop: what to run after every change.
@@ -191,7 +191,11 @@ def wheels_step() -> Step:
 
 
 def platform_step(suite: str, *options: str, minutes: int = 1) -> Step:
-    return lab_step(f"tests on Debian {suite}", suite, ["tests/platforms", *options], minutes)
+    """What users install there, and after a reboot what they have enabled."""
+    place = "tests/platforms"
+    step = lab_step(f"tests on Debian {suite}", suite, [place, *options], minutes)
+    around = [f"{place}/before_reboot.py", "--reboot--", *PYTEST, f"{place}/after_reboot.py"]
+    return replace(step, command=[*step.command, *around])
 
 
 def plan_system(form: str) -> list[Step]:

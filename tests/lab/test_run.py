@@ -148,8 +148,9 @@ def test_the_emulator_takes_and_gives(tmp_path: Path) -> None:
     assert_nothing_left()
 
 
-def test_reboot_between_commands() -> None:
-    env = {**os.environ, "LAB": "vm"}
+@pytest.mark.parametrize("form", ["vm", "container"])
+def test_reboot_between_commands(form: str) -> None:
+    env = {**os.environ, "LAB": form}
     script = "cat /proc/sys/kernel/random/boot_id; ls /var/tmp/kept; touch /var/tmp/kept"
     one = ("sh", "-c", f"{script}; true")
     status, out, _ = lab(env, "run", "--", *one, "--reboot--", *one)
@@ -161,6 +162,6 @@ def test_reboot_between_commands() -> None:
 
 
 def test_errors_are_one_line() -> None:
-    status, out, err = lab({**os.environ, "LAB": "container"}, "run", "a", "--reboot--", "b")
+    status, out, err = lab({**os.environ, "LAB": "container"}, "run", "--cuts", "a")
     assert (status, out) == (125, b"")
-    assert err == b"lab: cannot reboot a container (hint: LAB=vm)\n"
+    assert err == b"lab: cannot cut the power of a container (hint: LAB=vm)\n"

@@ -3,6 +3,7 @@
 import re
 
 from tests.deb.picture import lines_of_readme, text_of
+from tests.deb.typed_pages import ELSEWHERE, FROM_NOTHING, WITH_ROBOT
 from tests.system.typed import command_of, typed_lines
 from tests.unit.checkout import CHECKOUT
 
@@ -14,6 +15,17 @@ def test_links_lead_somewhere() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
             assert "://" in target or (page.parent / target).exists(), (page.name, target)
+
+
+def test_a_test_types_each_page_that_has_commands() -> None:
+    pages = {
+        str(page.relative_to(CHECKOUT))
+        for page in PAGES
+        if re.search(r"^\$ ", page.read_text(), re.MULTILINE)
+    }
+    assert pages == {*FROM_NOTHING, *WITH_ROBOT, *ELSEWHERE}
+    for page, test in ELSEWHERE.items():
+        assert page.rpartition("/")[2] in (CHECKOUT / test).read_text()
 
 
 def test_readme_is_short() -> None:
