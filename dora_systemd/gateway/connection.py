@@ -28,6 +28,8 @@ MAX_FRAME = 1024 * 1024
 
 _CLOSE_SECONDS = 10.0
 """Timeout for the other end to close, too."""
+_PART_SECONDS = 60.0
+"""Timeout for a part of a file to be taken."""
 _NAME = {"Server": "dora-systemd"}
 
 
@@ -80,23 +82,33 @@ class ServerSocket(Stream):
         return self._protocol.state is State.OPEN
 
     async def answer(self, answer: Answer) -> None:
-        """Send an HTTP response, which ends the connection. Raises OSError."""
+        """Send an HTTP response, which ends the connection after its rest. Raises OSError."""
         status = HTTPStatus(answer.status)
         fields: dict[str, Any] = {
             "Date": formatdate(usegmt=True),
             "Connection": "close",
-            "Content-Length": str(len(answer.body)),
+            "Content-Length": str(len(answer.body) + answer.rest_size),
             "Content-Type": answer.content_type,
             **answer.headers,
         }
-        await self._respond(Response(status.value, status.phrase, Headers(fields), answer.body))
+        response = Response(status.value, status.phrase, Headers(fields), answer.body)
+        await self._respond(response, is_whole=answer.rest is None)
 
-    async def _respond(self, response: Response) -> None:
+    async def send_rest(self, read: Callable[[], bytes]) -> None:
+        """Send what follows the body of an HTTP response. Raises OSError, TimeoutError."""
+        while part := await asyncio.to_thread(read):
+            self._writer.write(part)
+            async with asyncio.timeout(_PART_SECONDS):
+                await self._writer.drain()
+        self._writer.write_eof()
+
+    async def _respond(self, response: Response, is_whole: bool = True) -> None:
         """Past the protocol layer: it has already failed if more bytes follow the request."""
         response.headers.update(_NAME)
         self._writer.write(response.serialize())
         await self._writer.drain()
-        self._writer.write_eof()
+        if is_whole:
+            self._writer.write_eof()
 
     async def send(self, message: str | bytes | AsyncIterable[str]) -> None:
         """Send a message, whole or in parts; waits while the receiver is slow. Raises Gone."""

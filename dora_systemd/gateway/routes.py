@@ -1,12 +1,19 @@
 """The paths that the gateway serves; those of the status page are static files."""
 
 import asyncio
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.decisions.gateway.request import PLAIN, Answer, Get, Request, Talk
+from dora_systemd.decisions.gateway.request import (
+    PLAIN,
+    Answer,
+    Get,
+    Request,
+    Talk,
+    text_answer,
+)
 from dora_systemd.decisions.views.prometheus import CONTENT_TYPE, format_metrics
 from dora_systemd.gateway.control.serve import serve_control
 from dora_systemd.gateway.live.page import talk
@@ -37,7 +44,8 @@ HEADERS = {
 
 def page_routes() -> dict[str, Get]:
     """Return a route for each file of the page."""
-    names = sorted(path.name for path in DIRECTORY.iterdir() if path.suffix in TYPES)
+    found = (path for path in DIRECTORY.rglob("*") if path.suffix in TYPES)
+    names = sorted(str(path.relative_to(DIRECTORY)) for path in found)
     return {"/" if name == INDEX else f"{PREFIX}{name}": _answer_file for name in names}
 
 
@@ -74,6 +82,29 @@ GET: dict[str, Get] = {
     "/metrics": answer_metrics,
     **page_routes(),
 }
+BUNDLES = "/bundles/"
+
+
+async def answer_bundle(request: Request) -> Answer:
+    """Answer with a bundle: /bundles/NAME/BUNDLE. Raises DoraSystemdError."""
+    # Imported late: few download one, and its imports are memory.
+    from dora_systemd.verbs.bundles.listing import find_bundle, read_parts
+
+    name, _, ident = request.path.removeprefix(BUNDLES).partition("/")
+    found = await asyncio.to_thread(find_bundle, request.scope, name, ident)
+    if found is None:
+        return text_answer(404, "there is no such bundle")
+    headers = {**HEADERS, "Content-Disposition": f'attachment; filename="{found.id}"'}
+    return Answer(
+        200, "application/x-tar", b"", headers, partial(next, read_parts(found), b""), found.size
+    )
+
+
+def find_route(path: str) -> Get | None:
+    """The route of a path, None if there is nothing."""
+    return GET.get(path, answer_bundle if path.startswith(BUNDLES) else None)
+
+
 SOCKETS: dict[str, Talk] = {
     "/api/control": serve_control,
     "/api/live": talk,

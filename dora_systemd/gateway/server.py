@@ -9,7 +9,7 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -31,7 +31,7 @@ from dora_systemd.decisions.gateway.request import (
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.connection import Gone, ServerSocket
 from dora_systemd.gateway.live.actions import ACTIONS
-from dora_systemd.gateway.routes import GET, OPEN_TO_ALL, SOCKETS
+from dora_systemd.gateway.routes import OPEN_TO_ALL, SOCKETS, find_route
 from dora_systemd.scope import Scope
 from dora_systemd.trust.socket_table import peer_uid
 
@@ -112,9 +112,11 @@ class Gateway:
         try:
             with suppress(OSError, TimeoutError, WebSocketException):
                 async with asyncio.timeout(OPEN_SECONDS):
-                    request = await self._open(socket)
+                    request, rest = await self._open(socket)
                 if request is not None:
                     await self._talk(socket, request)
+                if rest is not None:
+                    await socket.send_rest(rest)
                 await socket.end()
         except Exception as error:
             log.error("cannot serve a connection: %s: %s", type(error).__name__, error)
@@ -124,16 +126,21 @@ class Gateway:
             self._count -= 1
             self._since = time.monotonic()
 
-    async def _open(self, socket: ServerSocket) -> RawRequest | None:
-        """Answer the request; the request itself if a WebSocket connection has begun."""
+    async def _open(
+        self, socket: ServerSocket
+    ) -> tuple[RawRequest | None, Callable[[], bytes] | None]:
+        """Answer the request; the request itself if a WebSocket connection has begun.
+
+        The second one reads the rest of the answer, which may take longer.
+        """
         raw = await socket.request()
         if raw is None:
-            return None
+            return None, None
         answer = await self._answer(socket, raw)
         if answer is None:
-            return raw if await socket.begin(raw) else None
+            return raw if await socket.begin(raw) else None, None
         await socket.answer(replace(answer, headers={**_ALWAYS, **answer.headers}))
-        return None
+        return None, answer.rest
 
     async def _answer(self, socket: ServerSocket, raw: RawRequest) -> Answer | None:
         """The answer to an HTTP request; None lets a WebSocket connection begin."""
@@ -164,10 +171,11 @@ class Gateway:
             return text_answer(405, "the gateway takes GET only", Allow="GET")
         if path in SOCKETS:
             return None if wants_socket else text_answer(426, "a WebSocket", Upgrade="websocket")
-        if path not in GET or wants_socket:
+        route = find_route(path)
+        if route is None or wants_socket:
             return text_answer(404, "there is nothing here")
         async with asyncio.timeout(_ANSWER_SECONDS):
-            return await GET[path](Request(path, self._scope))
+            return await route(Request(path, self._scope))
 
     async def _talk(self, socket: ServerSocket, raw: RawRequest) -> None:
         path = _path(raw)

@@ -41,8 +41,9 @@ from dora_systemd.decisions.dora.protocol import (
     parse_spawn_failure,
 )
 from dora_systemd.decisions.gateway.frames import Malformed, format_malformed, parse_request
-from dora_systemd.decisions.gateway.page_messages import parse_message
+from dora_systemd.decisions.gateway.page_messages import parse_message, shown_values
 from dora_systemd.decisions.gateway.request import has_token, refuse_address
+from dora_systemd.decisions.gateway.timeline import MOST_MARKS, timeline_values
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.logs.lines import (
     LineEncoder,
@@ -191,13 +192,23 @@ def _edit(data: bytes) -> None:
 
 
 def _advice(data: bytes) -> object:
-    return advise(collect(_happenings(data), {}), Current(frozenset({"camera", "a"})))
+    return advise(collect(_lives(data), {}), Current(frozenset({"camera", "a"})))
 
 
-def _happenings(data: bytes) -> list[Life]:
+def _happenings(data: bytes) -> list[Any]:
     records = [loaded(line) for line in data.splitlines()]
     found = [parse_happening(record) for record in records if isinstance(record, dict)]
-    return find_lives([one for one in found if one is not None])
+    return [one for one in found if one is not None]
+
+
+def _lives(data: bytes) -> list[Life]:
+    return find_lives(_happenings(data))
+
+
+def _timeline(data: bytes) -> None:
+    for is_up in (True, False):
+        found = timeline_values(_happenings(data), "u", is_up, "boot")
+        assert json.dumps(shown_values(found, MOST_MARKS)).isprintable()
 
 
 def _stack(data: bytes) -> None:
@@ -285,7 +296,8 @@ TARGETS = {
     "dora-line": Target(lambda data: _encoded(dora_log_fields(data))),
     "line-splitter": Target(_splitter),
     "line-encoder": Target(_encoder),
-    "journal": Target(_happenings),
+    "journal": Target(_lives),
+    "timeline": Target(_timeline),
     "advice": Target(_advice),
     "edit": Target(_edit, REFUSED),
     "stack": Target(_stack),

@@ -1,4 +1,7 @@
-"""LAB=browser: the tree of LAB=container with podman, and Chromium for tests of the status page."""
+"""LAB=browser: the tree of LAB=container with podman, and Chromium for tests of the status page.
+
+axe-core, which judges whether everybody can use the page, is in a package of PyPI.
+"""
 
 from pathlib import Path
 
@@ -10,6 +13,8 @@ from lab.process import run_logged
 
 # Without windows, and without the toolkit that Chromium proper brings for them.
 DEBIAN = ["chromium-headless-shell", "fonts-dejavu-core", "podman", "uidmap"]
+PYPI = ["axe-playwright-python==0.1.8"]
+AXE = "/opt/axe"
 # A boot starts none of what podman brings.
 UNITS = ["podman.socket", "podman.service", "podman-restart.service", "podman-auto-update.timer"]
 
@@ -31,11 +36,13 @@ def build_chromium(path: Path, cache: Path) -> None:
     log = cache / "browser.log"
     log.unlink(missing_ok=True)
     path.rmdir()
-    with Stage(f"{', '.join(DEBIAN)} from Debian"):
+    with Stage(f"{', '.join(DEBIAN)} from Debian, {PYPI[0]} from PyPI"):
         run_logged(["cp", "--archive", str(base), str(path)], log, "copy the base")
         run_in_tree(path, ["apt-get", "update"], log)
         run_in_tree(path, ["apt-get", "install", "-y", "--no-install-recommends", *DEBIAN], log)
         run_in_tree(path, ["apt-get", "clean"], log)
+        apart = ["--no-cache-dir", "--no-deps", f"--target={AXE}"]
+        run_in_tree(path, ["pip", "install", *apart, *PYPI], log)
         for where in ([], ["--global"]):
             run_in_tree(path, ["systemctl", *where, "disable", *UNITS], log)
 

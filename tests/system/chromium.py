@@ -145,7 +145,7 @@ class Browser:
 
     def press(self, key: str, text: str = "") -> None:
         """A key, as KeyboardEvent.key names it."""
-        codes = {"Enter": 13, "Tab": 9, "Escape": 27, " ": 32}
+        codes = {"Enter": 13, "Tab": 9, "Escape": 27, " ": 32, "ArrowLeft": 37, "End": 35}
         more = {"windowsVirtualKeyCode": codes[key], **({"text": text} if text else {})}
         self.call("Input.dispatchKeyEvent", type="keyDown", key=key, **more)
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key, **more)

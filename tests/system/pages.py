@@ -1,5 +1,16 @@
 """What the tests of the status page look at."""
 
+from pathlib import Path
+from typing import Any
+
+from tests.system.chromium import Browser
+
+AXE = Path("/opt/axe/axe_playwright_python/axe.min.js")
+_JUDGED = """
+axe.run(document, {resultTypes: ['violations']}).then((found) => found.violations.map(
+  (one) => [one.id, one.help, ...one.nodes.map((node) => node.html.slice(0, 300))]))
+"""
+
 CONTRAST = """
 (() => {
   const parse = (text) => text.match(/[\\d.]+/g).map(Number);
@@ -32,6 +43,15 @@ CUT = """
   .map((e) => e.textContent)
 """
 """Names that are not to be read in full."""
+
+
+def faults(browser: Browser) -> list[Any]:
+    """What axe-core finds on the page as it is now."""
+    if not browser.js("'axe' in window"):
+        browser.js(f"{AXE.read_text()};0")
+    found = browser.js(_JUDGED)
+    assert isinstance(found, list)
+    return found
 
 
 def node(name: str) -> str:

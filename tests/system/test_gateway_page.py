@@ -9,7 +9,7 @@ from tests.system import recorders
 from tests.system.cells import TICK, Cell, Project, journalctl, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
-from tests.system.pages import CONTRAST, node
+from tests.system.pages import CONTRAST, faults, node
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
 
@@ -230,16 +230,18 @@ def test_looks(scheme: str, browser: Browser, cell: Cell, project: Project) -> N
     browser.wait_text(".lines", "got [")
     browser.wait_js("document.querySelectorAll('.graph .box').length === 3")
     assert browser.js(CONTRAST) == []
+    assert faults(browser) == []
     browser.picture(f"desktop-{scheme}", is_whole=True)
-    browser.resize(360, 740, is_phone=True)
+    browser.resize(320, 740, is_phone=True)
     wait = "document.documentElement.scrollWidth"
-    assert browser.wait_js(wait) == 360
+    assert browser.wait_js(wait) == 320
     assert browser.js(CONTRAST) == []
     browser.picture(f"phone-{scheme}", is_whole=True)
     # The way back to the list, and no sideways scrolling there.
     browser.click(".return")
     browser.wait_js("document.body.dataset.view === 'list'")
-    assert browser.js(wait) == 360
+    assert browser.js(wait) == 320
+    assert faults(browser) == []
     browser.picture(f"phone-list-{scheme}")
     named = "[...document.querySelectorAll('button, select, input, a')]"
     nameless = f"{named}.filter((e) => e.checkVisibility()).filter((e) =>"

@@ -8,7 +8,7 @@ import pytest
 from tests.system.cells import THREE_NODES, TICK, Cell, Project, sync_journal, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
-from tests.system.pages import CONTRAST, CUT, box, node
+from tests.system.pages import CONTRAST, CUT, box, faults, node
 from tests.system.test_why import CRASHES, TAKER, bad, failed
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
@@ -48,11 +48,13 @@ def look(browser: Browser, name: str, scheme: str) -> None:
     browser.prefer(scheme)
     browser.wait_js("document.querySelectorAll('.graph .box').length > 1")
     assert browser.js(CONTRAST) == []
+    assert faults(browser) == []
     browser.picture(f"{name}-{scheme}", is_whole=True)
-    browser.resize(360, 740, is_phone=True)
-    browser.wait_js("document.documentElement.scrollWidth === 360")
+    browser.resize(320, 740, is_phone=True)
+    browser.wait_js("document.documentElement.scrollWidth === 320")
     assert browser.js(CONTRAST) == []
     assert browser.js(CUT) == []
+    assert faults(browser) == []
     browser.picture(f"{name}-phone-{scheme}", is_whole=True)
 
 
@@ -100,7 +102,7 @@ def test_one_that_is_degraded(scheme: str, browser: Browser, cell: Cell, project
     name = f"[...document.querySelectorAll({json.dumps(box(LONG) + ' .name')})]"
     assert browser.js(f"{name}.map((e) => e.textContent).join('')") == LONG
     # From the reason to the node's logs.
-    browser.click("#detail .why button")
+    browser.click("#detail .why button.small")
     browser.wait_js(f"document.querySelector('#log-node').value === {json.dumps(LONG)}")
     browser.wait_text(".lines", "RuntimeError: no camera")
     assert "got [" not in browser.text(".lines")
@@ -153,6 +155,7 @@ def test_mended_and_started_again(browser: Browser, cell: Cell, project: Project
     browser.wait_text("#said", "Dataflow restarted")
     browser.wait_text("#detail .badge", "Running")
     browser.wait_js("document.querySelector('#detail .why').hidden")
+    browser.wait_text("#host", "this machine:")
     browser.wait_text(f"{node('bad')} .badge", "Running")
     assert browser.failures() == []
 

@@ -85,6 +85,14 @@ def opened(path: Path) -> Iterator[Bundle]:
         raise unreadable(path, error) from error
 
 
+def chunks_of(path: Path) -> Iterator[bytes]:
+    """The bytes of a file, in parts; it is opened when the first part is read. Raises OSError."""
+    with open(os.open(path, _FLAGS | os.O_NOFOLLOW), "rb") as file:  # noqa: PTH123 - of a descriptor
+        check_regular(os.fstat(file.fileno()).st_mode)
+        while data := file.read(_CHUNK):
+            yield data
+
+
 def _places(path: Path, file: BinaryIO) -> dict[str, tuple[int, int]]:
     """Find the parts by their headers, without reading what is between these."""
     found: dict[str, tuple[int, int]] = {}

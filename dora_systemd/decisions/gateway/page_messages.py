@@ -11,6 +11,9 @@ The page sends, each with its `type`:
   about     {dataflow}
   ended     {}
   releases  {dataflow}
+  timeline  {dataflow}
+  bundles   {dataflow}
+  waits     {dataflow}
   act       {action, dataflow, node, number, values, release}
                                               action: one of ACTIONS; node "": the dataflow;
                                               values: texts by the settings of "set"; release: of
@@ -18,13 +21,20 @@ The page sends, each with its `type`:
 
 It receives:
   hello     {version, host, scope}            first
-  snapshot  {dataflows}                       repeatedly; each as in snapshot.observed_values
+  snapshot  {dataflows, host}                 repeatedly; each as in snapshot.observed_values;
+                                              host: as in HostUse.values()
   graph     {dataflow, nodes, edges, problem}
   about     {dataflow, row, why, facts, problem}
                                               row: as `list` has it, with the nodes of an ended one;
                                               why: as in report_object; facts: see fact_values()
   ended     {dataflows, problem}              those that systemd has unloaded, newest first
   releases  {dataflow, releases, problem}     as `doractl releases -o json` has them, newest first
+  timeline  {dataflow, lives, marks, is_cut, now_us, since_us, problem}
+                                              lives, marks: see timeline.py, oldest first; is_cut:
+                                              whether there is more between since_us and these
+  bundles   {dataflow, bundles, problem}      as `doractl bundles -o json` has them, newest first
+  waits     {dataflow, waits, remedies, problem}
+                                              nodes that waited for a CPU and who had it, as `why`
   lines     {number, lines, skipped}          lines: {at_us, node, text, priority, event};
                                               skipped: number of lines left out before these
   file      {number, text}                    a part of the file, in order
@@ -59,8 +69,9 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, one_line, without_sequences
 from dora_systemd.values import INFINITY, format_moment
 
-TYPES = ("follow", "find", "save", "unfollow", "graph", "about", "ended", "releases", "act")
-ACTIONS = ("stop", "start", "restart", "enable", "disable", "reload", "set", "rollback")
+QUESTIONS = ("graph", "about", "ended", "releases", "timeline", "waits", "bundles")
+TYPES = ("follow", "find", "save", "unfollow", "act", *QUESTIONS)
+ACTIONS = ("stop", "start", "restart", "enable", "disable", "reload", "set", "rollback", "bundle")
 RUNS = ("", "CURRENT", "PREVIOUS")
 HOT_RELOAD = "hot_reload"
 LOG_FIELDS = "MESSAGE,PRIORITY,DORA_NODE,DORA_EVENT,SYSLOG_IDENTIFIER"
@@ -148,12 +159,12 @@ def saved_line(line: Mapping[str, Any]) -> str:
     return f"{format_moment(line['at_us'])} {origin}: {one_line(line['text'])}\n"
 
 
-def shown_values(value: Any) -> Any:
-    """A JSON value with printable texts of MAX_TEXT and lists of MAX_ITEMS: nodes write them."""
+def shown_values(value: Any, most: int = MAX_ITEMS) -> Any:
+    """A JSON value with printable texts of MAX_TEXT and lists of `most`: nodes write them."""
     if isinstance(value, Mapping):
-        return {key: shown_values(one) for key, one in value.items()}
+        return {key: shown_values(one, most) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [shown_values(one) for one in value[-MAX_ITEMS:]]
+        return [shown_values(one, most) for one in value[-most:]]
     return _printable(value) if isinstance(value, str) else value
 
 

@@ -35,6 +35,9 @@ class Answer:
     body: bytes
     # in addition to Content-Type and Content-Length
     headers: Mapping[str, str] = field(default_factory=dict)
+    # reads the next part of what follows the body, b"" after the last one; rest_size: its bytes
+    rest: Callable[[], bytes] | None = None
+    rest_size: int = 0
 
 
 class Socket(Protocol):

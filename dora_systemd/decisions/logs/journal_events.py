@@ -170,6 +170,7 @@ END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
 # Each life of a node's process ends with one of these.
 NODE_END_EVENTS = ("node-exited", "node-crashed", "node-ended", "node-oom")
 
+START_ASKED = "start-asked"
 ROLLED_BACK = "release-rolled-back"
 BUILD_FAILED = "build-failed"
 FORGOTTEN = "dataflow-forgotten"

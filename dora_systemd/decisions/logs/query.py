@@ -35,6 +35,8 @@ UNIT_FAILED = "d9b373ed55a64feb8242e02dbe79a49c"
 """MESSAGE_ID of systemd's record when a unit has failed."""
 
 UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", UNIT_FAILED)
+UNIT_RESTART = "5eb03494b6584870a536b337290809b3"
+"""MESSAGE_ID of systemd's record when it restarts a unit automatically."""
 
 ALL_LINES = "all"
 """The value of --lines for all lines, also with --follow."""
@@ -174,6 +176,18 @@ def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
     own = [*scope_matches(scope, name), dataflow, *_event_matches()]
     asked = [dataflow, *_asked_matches(scope, *REQUESTS)]
     return [*own, "+", *_systemd_matches(scope, name), "+", *asked]
+
+
+def timeline_matches(
+    scope: Scope, name: str, uuid: str, events: Sequence[str], requests: Sequence[str]
+) -> list[str]:
+    """Matches for these life events, systemd's records of lives of the unit, and requests."""
+    dataflow = f"DORA_DATAFLOW={uuid}"
+    own = [*scope_matches(scope, name), dataflow, *(f"DORA_EVENT={one}" for one in events)]
+    ids = (UNIT_STARTING, UNIT_RESTART, *UNIT_ENDS)
+    lives = [*_systemd_matches(scope, name), *(f"MESSAGE_ID={one}" for one in ids)]
+    asked = [dataflow, *_asked_matches(scope, *requests)]
+    return [*own, "+", *lives, "+", *asked]
 
 
 def bundle_matches(scope: Scope, name: str, uuid: str) -> list[str]:

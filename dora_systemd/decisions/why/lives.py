@@ -11,7 +11,7 @@ from typing import Any
 
 from dora_systemd.decisions.cell.status import STOP
 from dora_systemd.decisions.logs.journal_events import REQUESTS
-from dora_systemd.decisions.logs.query import UNIT_FAILED, UNIT_STARTING
+from dora_systemd.decisions.logs.query import UNIT_FAILED, UNIT_RESTART, UNIT_STARTING
 from dora_systemd.decisions.views.facts import NodeRow
 
 # https://github.com/systemd/systemd/blob/main/src/systemd/sd-messages.h
@@ -23,7 +23,7 @@ UNIT_MESSAGES = {
     "7ad2d189f7e94e70a38c781354912448": "unit-succeeded",
     UNIT_FAILED: "unit-failed",
     "98e322203f7a4ed290d09fe03c09fe15": "process-exited",
-    "5eb03494b6584870a536b337290809b3": "unit-restart",
+    UNIT_RESTART: "unit-restart",
     "fe6faa94e7774663a0da52717891d8ef": "unit-oom",
 }
 """systemd's own records about a unit: SD_MESSAGE_UNIT_* by MESSAGE_ID."""

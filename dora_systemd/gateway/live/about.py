@@ -15,10 +15,14 @@ from dora_systemd.decisions.views.dataflows import is_up_word
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Report, report_object
+from dora_systemd.decisions.why.waits import wait_remedies
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_rows
+from dora_systemd.verbs.facts.reading import read_dataflow
+from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.waits import read_cpu_waits
 from dora_systemd.verbs.list import find_row
 from dora_systemd.verbs.why import explain
 
@@ -62,6 +66,27 @@ def read_own_releases(scope: Scope, uuid: str) -> dict[str, Any]:
     bus = Bus(scope, for_reading=True)
     rows = read_releases(bus, scope, [find_row(bus, scope, uuid).name])
     return {"releases": shown_values(list(map(release_object, rows[:MAX_ITEMS])))}
+
+
+def read_own_bundles(scope: Scope, uuid: str) -> dict[str, Any]:
+    """The bundles of a dataflow, newest first. Raises DoraSystemdError."""
+    # Imported late: only a dataflow on a page needs it.
+    from dora_systemd.decisions.bundles.table import bundle_object
+    from dora_systemd.verbs.bundles.listing import read_bundles
+
+    bus = Bus(scope, for_reading=True)
+    rows = read_bundles(scope, [find_row(bus, scope, uuid).name])
+    return {"bundles": shown_values(list(map(bundle_object, rows[:MAX_ITEMS])))}
+
+
+def read_waits(scope: Scope, uuid: str) -> dict[str, Any]:
+    """The nodes of a dataflow that wait for a CPU, and who has it. Raises DoraSystemdError."""
+    bus = Bus(scope, for_reading=True)
+    cell = Selector(uuid).find(bus)
+    waits = read_cpu_waits(read_dataflow(bus, scope, cell)) if cell.is_up else ()
+    found = {"waits": list(map(str, waits)), "remedies": wait_remedies(waits, cell.name)}
+    values: dict[str, Any] = shown_values(found)
+    return values
 
 
 def _with_end(row: DataflowRow, report: Report) -> DataflowRow:

@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -109,6 +110,8 @@ def act(scope: Scope, message: PageMessage, manager: Manager | None = None) -> s
     manager: None for a new connection to systemd. Raises DoraSystemdError as the verbs of doractl
     do.
     """
+    if message.action == "bundle":
+        return _write_bundle(scope, message.dataflow)
     bus = manager or Bus(scope)
     known = find_start(bus, scope, Selector(message.dataflow))
     if message.action == "rollback":
@@ -174,6 +177,15 @@ def _roll_back(manager: Manager, scope: Scope, name: str, release: str) -> str:
         done = roll_back(manager, scope, name, release or None, 0, action.go_on, by=_BY)
     how = f"runs release {done.release}" if done.release else "has ended its trial"
     return f"Dataflow rolled back: {done.uuid} ({name}) {how}"
+
+
+def _write_bundle(scope: Scope, uuid: str) -> str:
+    # Imported late: few write one, and its imports are memory.
+    from dora_systemd.verbs.bundles.write import write_bundle
+
+    done = write_bundle(partial(Bus, for_reading=True), scope, uuid, _BY)
+    missing = (f"not in the bundle: {one}" for one in done.errors)
+    return _joined(f"Bundle written: {done.path.name} ({done.name})", *missing)
 
 
 def _joined(*texts: str) -> str:

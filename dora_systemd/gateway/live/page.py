@@ -14,7 +14,13 @@ from dora_systemd.decisions.gateway.page_messages import PageMessage, parse_mess
 from dora_systemd.decisions.gateway.request import Request, Socket
 from dora_systemd.decisions.views.snapshot import observed_values
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.gateway.live.about import read_about, read_ended, read_own_releases
+from dora_systemd.gateway.live.about import (
+    read_about,
+    read_ended,
+    read_own_bundles,
+    read_own_releases,
+    read_waits,
+)
 from dora_systemd.gateway.live.actions import act, read_graph
 from dora_systemd.gateway.live.lines import (
     MAX_FOUND,
@@ -24,8 +30,10 @@ from dora_systemd.gateway.live.lines import (
     find_lines,
     follow_lines,
 )
+from dora_systemd.gateway.live.past import read_timeline
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
+from dora_systemd.verbs.facts.host import read_host
 from dora_systemd.verbs.top import read_snapshot
 
 INTERVAL_SECONDS = 2.0
@@ -33,7 +41,7 @@ LONGEST_SECONDS = 10.0
 """Between snapshots, of any number of dataflows."""
 SHARE = 0.02
 """Maximum share of one CPU for the snapshots of a page; with many dataflows the interval grows."""
-MAX_TASKS = 8
+MAX_TASKS = 16
 """Maximum parallel questions and actions of one page."""
 
 QUESTIONS: Mapping[str, Callable[[Scope, str], dict[str, Any]]] = {
@@ -41,6 +49,9 @@ QUESTIONS: Mapping[str, Callable[[Scope, str], dict[str, Any]]] = {
     "about": read_about,
     "ended": read_ended,
     "releases": read_own_releases,
+    "timeline": read_timeline,
+    "bundles": read_own_bundles,
+    "waits": read_waits,
 }
 _STREAMS = ("follow", "find", "unfollow")
 """Messages that start or end a stream of lines; each ends the stream before it."""
@@ -142,7 +153,7 @@ class Page:
         except DoraSystemdError as error:
             await self._send(type="problem", text=error.message, hint=error.hint)
         else:
-            await self._send(type="snapshot", dataflows=values)
+            await self._send(type="snapshot", **values)
 
     async def _follow(self, message: PageMessage) -> None:
         try:
@@ -218,6 +229,6 @@ def _greeting(scope: Scope) -> dict[str, str]:
     return {"version": __version__, "host": sockets.gethostname(), "scope": whose}
 
 
-def _snapshot(scope: Scope) -> list[dict[str, Any]]:
+def _snapshot(scope: Scope) -> dict[str, Any]:
     found = read_snapshot(Bus(scope, for_reading=True), scope, is_whole=True)
-    return [observed_values(one) for one in found]
+    return {"dataflows": list(map(observed_values, found)), "host": read_host().values()}

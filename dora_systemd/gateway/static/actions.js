@@ -22,6 +22,9 @@ const ACTIONS = {
   disable: ["Not at boot", "It no longer starts at boot; if it runs, it keeps running.", "disabling"],
   rollback: ["Roll back", "The older release starts in place of the present one. If not all of its "
     + "nodes become ready, or one fails, the present one runs again.", "rolling back"],
+  bundle: ["Write a bundle of", "What is known of it now goes to one file, with what its nodes have logged. "
+    + "The settings and arguments of the nodes, and values of variables, stay out.",
+  "writing a bundle of"],
   set: SET,
   "hot-reload": ["Hot reload", "While it is on, nodes restart when their files change.", "changing"],
   "set node": SET,
@@ -66,7 +69,9 @@ export class Buttons {
       } }, ACTIONS[action][0]);
     this.all = Object.fromEntries(Object.keys(ACTIONS).filter((one) => !one.endsWith(" node"))
       .map((action) => [action, button(action)]));
-    const { start, stop, restart, ...rest } = this.all;
+    // That of bundles stands beside these.
+    const { start, stop, restart, bundle, ...rest } = this.all;
+    say(bundle, "Write a bundle");
     const leave = (event) => {
       if (event.key !== "Escape" || !this.menu.open) return;
       this.menu.open = false;

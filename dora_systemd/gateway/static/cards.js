@@ -5,6 +5,9 @@ import { newest } from "./history.js";
 import { cpuChart, memoryChart, showState, showUse } from "./parts.js";
 import { bytes, isUp, percent, plural, since, uptime } from "./words.js";
 
+const MANY = 5;
+const NEARLY_FULL = 0.1;
+
 export class Card {
   constructor(uuid) {
     this.name = el("strong");
@@ -33,6 +36,51 @@ export class Card {
     if (isChosen) this.node.setAttribute("aria-current", "true");
     else this.node.removeAttribute("aria-current");
   }
+}
+
+const by = (id) => document.getElementById(id);
+
+/** Those of the dataflows that have all words of the filter, which is there if they are many. */
+export class Filter {
+  constructor(onChange) {
+    this.text = by("filter-text");
+    this.text.oninput = onChange;
+  }
+
+  /** all: as many as there are, shown or not. */
+  show(all, shown) {
+    by("filter").hidden = all <= MANY && !this.text.value;
+    say(by("filtered"), this.text.value ? `${shown} of ${plural(all, "dataflow")}` : "");
+    by("filtered").hidden = !this.text.value;
+  }
+
+  of(flows) {
+    const words = this.text.value.toLowerCase().split(/\s+/);
+    return flows.filter((flow) => {
+      const parts = [flow.name, flow.status, flow.release, flow.uuid, flow.text,
+        ...(flow.nodes ?? []).map(({ node }) => node)];
+      const text = parts.join("\n").toLowerCase();
+      return words.every((word) => text.includes(word));
+    });
+  }
+}
+
+/** What the whole machine uses. before: the numbers of the snapshot before, or null. */
+export function hostWords(host, before) {
+  const found = [];
+  const all = before ? host.ticks - before.ticks : 0;
+  const busy = all > 0 ? (100 * (host.busy_ticks - before.busy_ticks)) / all : null;
+  if (busy != null) found.push([`CPU ${percent(busy * host.cpus)} of ${percent(100 * host.cpus)}`, busy > 90]);
+  if (host.memory_bytes) {
+    const left = host.memory_available_bytes / host.memory_bytes;
+    found.push([`memory ${bytes(host.memory_bytes - host.memory_available_bytes)} of ${
+      bytes(host.memory_bytes)}`, left < NEARLY_FULL]);
+  }
+  if (host.disk_bytes) {
+    found.push([`disk ${bytes(host.disk_free_bytes)} free on ${host.disk}`,
+      host.disk_free_bytes / host.disk_bytes < NEARLY_FULL]);
+  }
+  return found;
 }
 
 /** What all of them use together, after how many need a hand. */

@@ -3,11 +3,13 @@
 import { Buttons } from "./actions.js";
 import { arrange, el, say } from "./dom.js";
 import { Graph } from "./graph.js";
-import { waitWords } from "./history.js";
 import { Logs } from "./logs.js";
 import { NodeRow } from "./nodes.js";
 import { Facts, cpuChart, memoryChart, showState, showUse } from "./parts.js";
-import { Releases } from "./releases.js";
+import { Bundles } from "./past/bundles.js";
+import { Releases } from "./past/releases.js";
+import { Timeline } from "./past/timeline.js";
+import { Waits } from "./waits.js";
 import { Why } from "./why.js";
 import { bytes, isUp, since, uptime } from "./words.js";
 
@@ -47,12 +49,19 @@ export class Detail {
     this.buttons = new Buttons(ask);
     this.facts = new Facts();
     this.charts = { cpu: cpuChart(), memory: memoryChart() };
-    this.waits = el("p", { class: "waits", hidden: true });
+    this.waits = new Waits(() => this.send({ type: "waits" }));
     const choose = (node) => this.#choose(node);
-    this.why = new Why((node) => this.follow(node));
+    this.why = new Why((node) => this.follow(node), ask);
     this.graph = new Graph(choose);
     this.nodes = el("ul", { class: "nodes" });
     this.releases = new Releases((release) => ask("rollback", "", release));
+    // A new bundle is an event of the timeline.
+    const askPast = () => {
+      this.send({ type: "timeline" });
+      this.send({ type: "bundles" });
+    };
+    this.timeline = new Timeline(askPast, (at) => this.#showLog(at));
+    this.bundles = new Bundles(this.buttons.all.bundle);
     this.logs = new Logs((node) => this.follow(node), this.send);
     const panel = (title, label, node) => el("section", { class: "panel", "aria-label": label },
       el("div", { class: "head" }, el("h2", {}, title)), node);
@@ -65,15 +74,21 @@ export class Detail {
         this.buttons.node),
       this.why.node, this.facts.node,
       el("div", { class: "charts" }, this.charts.cpu.node, this.charts.memory.node),
-      this.waits, ...this.panels, this.releases.node, this.logs.node);
+      this.waits.node, this.timeline.node, ...this.panels, this.releases.node,
+      this.bundles.node, this.logs.node);
   }
 
   /** Asks for what comes once: after each connection. */
   begin() {
     this.send({ type: "graph" });
     this.asks = 2;
-    this.releases.isDue = true;
+    this.releases.isDue = this.timeline.isDue = true;
     this.logs.begin(this.chosen);
+  }
+
+  #showLog(at) {
+    if (this.chosen) this.follow("");
+    this.logs.showAt(at);
   }
 
   /** A click on a node shows its logs, another one those of all. */
@@ -95,9 +110,15 @@ export class Detail {
   }
 
   /** After an action. */
+  acted() {
+    say(this.buttons.pending, "");
+    this.timeline.askedAt = 0;
+    this.askAbout();
+  }
+
   askAbout() {
     this.send({ type: "about" });
-    this.releases.isDue = true;
+    this.releases.isDue = this.timeline.isDue = true;
   }
 
   show(flow, history, isFree) {
@@ -107,17 +128,18 @@ export class Detail {
     this.logs.name = flow.name;
     say(this.title, flow.name);
     showState(this.badge, flow.status);
-    // Below, it is the summary of why.
-    say(this.text, flow.text === this.about?.why?.summary ? "" : flow.text);
-    this.why.tick();
+    // Below, it is what why says.
+    say(this.text, this.why.node.hidden ? flow.text : "");
+    this.why.tick(isFree);
     const own = history.of(flow.uuid);
     showUse(this.charts, own, flow);
-    say(this.waits, waitWords(own.waits));
-    this.waits.hidden = !this.waits.textContent;
+    this.waits.show(flow, history);
+    this.timeline.show(flow, history.longOf(flow.uuid));
     this.#showFacts(shown);
     this.#showNodes(shown, isFree && isUp(flow));
     this.buttons.show(flow, this.about, isFree);
-    this.releases.show(flow.release, isFree);
+    this.releases.show(flow, isFree);
+    this.bundles.show(flow);
   }
 
   /** Another state has another reason, and another run may have other nodes and wires. */

@@ -2,6 +2,8 @@
 // computed here, from two snapshots.
 
 export const KEPT = 150;
+export const SLOW_US = 10e6;
+const SLOW_KEPT = 8640;
 const WORTH = 5;
 
 const series = () => ({ cpu: [], memory: [], times: [], waits: {} });
@@ -10,6 +12,12 @@ export class History {
   constructor() {
     this.last = new Map();
     this.groups = new Map();
+    this.slow = new Map();
+  }
+
+  /** The most that a dataflow has used in each ten seconds since the page was opened. */
+  longOf(uuid) {
+    return this.slow.get(uuid) ?? [];
   }
 
   /** What is known of one group: its series, oldest first. */
@@ -47,6 +55,17 @@ export class History {
     kept.waits = isSame ? this.#waits(now, before, share) : {};
     for (const list of [kept.cpu, kept.memory, kept.times]) if (list.length > KEPT) list.shift();
     this.groups.set(key, kept);
+    if (key.endsWith(" ")) this.#keepLong(key.trim(), newest(kept.cpu), newest(kept.memory));
+  }
+
+  #keepLong(uuid, cpu, memory) {
+    const at = Math.floor((Date.now() * 1000) / SLOW_US) * SLOW_US;
+    const points = this.longOf(uuid);
+    const last = points.at(-1);
+    if (last?.at === at) Object.assign(last, { cpu: Math.max(last.cpu, cpu), memory: Math.max(last.memory, memory) });
+    else points.push({ at, cpu, memory });
+    if (points.length > SLOW_KEPT) points.shift();
+    this.slow.set(uuid, points);
   }
 
   #waits(now, before, share) {
@@ -61,9 +80,12 @@ export class History {
 
 export const newest = (list) => (list.length ? list[list.length - 1] : null);
 
-/** "waits for memory 12 %, io 8 %", or nothing: only what is worth a look. */
+const WAITS = { cpu: "a CPU", memory: "memory", io: "a disk", irq: "interrupt handlers" };
+
+/** "waited for a disk 12 % of the time, for memory 8 %", or nothing: only what is worth a look. */
 export function waitWords(waits) {
   const sorted = Object.entries(waits).sort((a, b) => b[1] - a[1]);
-  const words = sorted.map(([resource, share]) => `${resource} ${share.toFixed(0)}\u00a0%`);
-  return words.length ? `waits for ${words.join(", ")}` : "";
+  const words = sorted.map(([resource, share], at) =>
+    `for ${WAITS[resource] ?? resource} ${share.toFixed(0)}\u00a0%${at ? "" : " of the time"}`);
+  return words.length ? `waited ${words.join(", ")}` : "";
 }

@@ -2,12 +2,16 @@
 // lines only; a file has more.
 
 import { el, say } from "./dom.js";
-import { clock, plural } from "./words.js";
+import { clock, local, plural, since, zoneWords } from "./words.js";
 
 export const MOST = 1000;
 const COLORS = 8;
+const WIDEST = 22;
 const NEAR = 24;
 const KEPT_MS = 60000;
+// What is shown around a moment, in µs.
+const BEFORE = 30e6;
+const AFTER = 5e6;
 
 const LEVELS = [[7, "All"], [6, "Info and above"], [4, "Warnings and errors"], [3, "Errors"]];
 const RUNS = [["", "all runs"], ["CURRENT", "last run"], ["PREVIOUS", "run before"]];
@@ -60,7 +64,7 @@ export class Logs {
       "aria-label": "Log lines", onscroll: () => this.#scrolled() });
     this.node = el("section", { class: "panel logs", "aria-labelledby": "log-title" },
       el("div", { class: "head" },
-        el("h2", { id: "log-title" }, "Logs"), this.found,
+        el("h2", { id: "log-title" }, "Logs"), el("span", { class: "muted zone" }, zoneWords()), this.found,
         field("log-node", "of", this.pick), field("log-level", "level", this.level),
         field("log-run", "run", this.run), field("log-time", "time", this.time), this.range,
         field("log-search", "search", this.search),
@@ -78,8 +82,21 @@ export class Logs {
     this.ask();
   }
 
-  /** Asks the gateway: for new lines as they come, or for what the fields ask for. */
-  ask() {
+  /** Shows the lines around a time, of all nodes. */
+  showAt(us) {
+    Object.assign(this.time, { value: "range" });
+    this.from.value = local(us - BEFORE);
+    this.to.value = local(us + AFTER + 1e6);
+    this.run.value = this.search.value = "";
+    this.ask(us);
+    this.node.scrollIntoView({ block: "start" });
+    this.lines.focus({ preventScroll: true });
+  }
+
+  /** Asks the gateway: for new lines as they come, or for what the fields ask for. moment: the time
+   * to show then. */
+  ask(moment = 0) {
+    this.moment = moment;
     this.range.hidden = this.time.value !== "range";
     const wanted = this.#wanted();
     this.isSearch = Object.values(wanted).some(Boolean);
@@ -106,6 +123,8 @@ export class Logs {
   offer(names) {
     if (names.join("\n") === this.names.join("\n") && this.pick.options.length) return;
     this.names = names;
+    const longest = Math.max(...names.map((name) => name.length), "dataflow".length);
+    this.lines.style.setProperty("--who", `${Math.min(longest, WIDEST) + 1}ch`);
     this.pick.replaceChildren(el("option", { value: "" }, "all nodes"),
       ...names.map((name) => el("option", { value: name }, name)));
     this.#choose();
@@ -142,7 +161,17 @@ export class Logs {
       this.lines.replaceChildren(el("p", { class: "muted empty" }, text));
     }
     const told = isWhole ? plural(count, "line") : `the newest ${plural(count, "line")}`;
-    say(this.found, problem ? "" : `${told} found`);
+    const where = this.moment ? ` around ${since(this.moment)}` : "";
+    say(this.found, problem ? "" : `${told} found${where}`);
+    if (this.moment) this.#showMoment();
+  }
+
+  /** Scrolls to the last line before the moment. */
+  #showMoment() {
+    const before = [...this.lines.children].filter((one) => Number(one.dataset.at) <= this.moment);
+    const line = before.at(-1) ?? this.lines.firstElementChild;
+    line.classList.add("moment");
+    this.lines.scrollTop = line.offsetTop - this.lines.offsetTop - this.lines.clientHeight / 2;
   }
 
   #save() {
@@ -163,7 +192,7 @@ export class Logs {
   }
 
   #line(line) {
-    return el("p", { class: kind(line), "data-priority": line.priority,
+    return el("p", { class: kind(line), "data-priority": line.priority, "data-at": line.at_us,
       hidden: line.priority > this.level.value },
     el("time", { title: new Date(line.at_us / 1000).toLocaleString() }, clock(line.at_us)),
     this.chosen ? null : el("span", { class: `who c${colorOf(line.node)}` }, line.node || "dataflow"),

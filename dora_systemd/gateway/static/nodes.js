@@ -19,6 +19,10 @@ function stopWords({ stop_left_us: left }) {
   return typeof left === "number" ? `${Math.round(left / 1e6)} s left to stop` : "";
 }
 
+/** How often dora has restarted the node, and how often it may. */
+const restartWords = ({ restarts, max_restarts: most }) =>
+  `${plural(restarts, "restart")}${most ? ` of ${most}` : ""}`;
+
 export class NodeRow {
   /** ask: is called with an action and the node. choose: with the node whose logs are wanted. */
   constructor(name, ask, choose) {
@@ -29,6 +33,7 @@ export class NodeRow {
     this.sign = el("span", { class: "sign" });
     this.rights = el("span", { class: "rights" });
     this.up = el("span", { class: "up" });
+    this.pid = el("span", { class: "pid" });
     this.restarts = el("span", { class: "restarts" });
     this.charts = { cpu: cpuChart("small"), memory: memoryChart("small") };
     this.waits = el("span", { class: "waits" });
@@ -40,7 +45,7 @@ export class NodeRow {
       title: `Show the logs of ${name}`, onclick: () => choose(name) }, name);
     this.node = el("li", { "data-node": name },
       el("div", { class: "what" }, this.choose, this.badge, this.exit, this.said),
-      el("div", { class: "facts muted" }, this.machine, this.up, this.restarts, this.rights,
+      el("div", { class: "facts muted" }, this.machine, this.up, this.pid, this.restarts, this.rights,
         this.sign, this.waits),
       this.charts.cpu.node, this.charts.memory.node,
       el("div", { class: "buttons" }, this.buttons.restart, this.buttons.stop, this.limits));
@@ -59,7 +64,8 @@ export class NodeRow {
     say(this.sign, stopWords(facts) || (isAlive ? signWords(facts) : ""));
     const ended = at ? since(at) : "";
     say(this.up, isAlive ? `up ${uptime(at ? Date.now() * 1000 - at : null)}` : ended);
-    say(this.restarts, restarts ? plural(restarts, "restart") : "");
+    say(this.pid, isAlive && facts.pid ? `PID ${facts.pid}` : "");
+    say(this.restarts, restarts ? restartWords(facts) : "");
     say(this.waits, waitWords(history.waits));
     showUse(this.charts, history, facts);
     this.choose.setAttribute("aria-pressed", String(isChosen));

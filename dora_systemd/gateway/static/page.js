@@ -1,7 +1,7 @@
 // The status page: what comes from the gateway goes to the list and to the dataflow that is chosen.
 
 import { askFirst, doing, tell } from "./actions.js";
-import { Card, totals } from "./cards.js";
+import { Card, Filter, hostWords, totals } from "./cards.js";
 import { Detail } from "./detail.js";
 import { arrange, el, say } from "./dom.js";
 import { History } from "./history.js";
@@ -20,15 +20,23 @@ let detail = null;
 let kept = "";
 let number = 0;
 
+let hostBefore = null;
 const link = new Link(take, showLink);
+const filter = new Filter(() => show());
 
 const TAKERS = {
   hello: begin,
-  snapshot: ({ dataflows }) => update(dataflows),
+  snapshot: ({ dataflows, host }) => {
+    showHost(host ?? {});
+    update(dataflows);
+  },
   ended: showEnded,
   graph: (message) => detail?.graph.show(message),
   about: (message) => detail?.learn(message),
   releases: (message) => detail?.releases.take(message),
+  timeline: (message) => detail?.timeline.take(message),
+  bundles: (message) => detail?.bundles.take(message),
+  waits: (message) => detail?.waits.take(message),
   lines: (message) => detail?.logs.take(message),
   found: (message) => detail?.logs.take(message),
   file: (message) => detail?.logs.take(message),
@@ -36,8 +44,11 @@ const TAKERS = {
   problem: showProblem,
 };
 
+// Answers about the dataflow that was chosen when they were asked for.
+const OWN = ["graph", "about", "releases", "timeline", "waits", "bundles"];
+
 function take(message) {
-  const isForeign = ["graph", "about", "releases"].includes(message.type) && message.dataflow !== detail?.uuid;
+  const isForeign = OWN.includes(message.type) && message.dataflow !== detail?.uuid;
   if (!isForeign) TAKERS[message.type]?.(message);
 }
 
@@ -88,14 +99,23 @@ function choose() {
 }
 
 function show() {
-  showCards(by("list"), cards, flows);
-  showCards(by("ended-list"), endedCards, ended ?? []);
-  by("ended").hidden = !ended?.length;
-  say(by("ended-title"), `Ended (${ended?.length ?? 0})`);
+  const [some, gone] = [filter.of(flows), filter.of(ended ?? [])];
+  filter.show(flows.length + (ended?.length ?? 0), some.length + gone.length);
+  showCards(by("list"), cards, some);
+  showCards(by("ended-list"), endedCards, gone);
+  by("ended").hidden = !gone.length;
+  say(by("ended-title"), `Ended (${gone.length})`);
   if (detail) showDetail(flowOf(detail.uuid));
   const words = totals(flows, history).map((word) => el("span", {}, word));
   by("totals").replaceChildren(...words);
   showNothing();
+}
+
+function showHost(host) {
+  const words = hostWords(host, hostBefore).map(([text, isBad]) =>
+    el("span", { class: isBad ? "scarce" : null }, text));
+  by("host").replaceChildren(el("span", {}, "this machine:"), ...words);
+  hostBefore = host;
 }
 
 function showCards(parent, known, shown) {
@@ -164,10 +184,7 @@ function act(flow, action, node, values, release = "") {
 function acted(message) {
   const uuid = actions.get(message.number);
   actions.delete(message.number);
-  if (detail && detail.uuid === uuid) {
-    say(detail.buttons.pending, "");
-    detail.askAbout();
-  }
+  if (detail && detail.uuid === uuid) detail.acted();
   tell(message);
   show();
 }

@@ -2,7 +2,7 @@
 
 import { el } from "./dom.js";
 import { Facts, showState } from "./parts.js";
-import { bytes, clock, since, span, tone } from "./words.js";
+import { bytes, clock, isUp, since, span, tone } from "./words.js";
 
 const TITLES = {
   Failed: "Why it failed", Degraded: "Why it is degraded", Restarting: "Why it restarts",
@@ -42,12 +42,25 @@ const list = (title, className, items) => (items.length
 const remedy = (text) => el("li", {}, ...text.split(COMMAND).map((part, at) =>
   (at % 2 ? el("code", {}, part) : part)));
 
+// What a remedy can be done with here, by the command that it names.
+const DONE_BY = { start: ["start", "Start"], restart: ["restart", "Restart"], stop: ["stop", "Stop"],
+  reload: ["reload", "Reload"], rollback: ["rollback", "Roll back"] };
+
+/** The actions that the remedies for a dataflow name, the first one first. */
+function actionsOf({ remedies, name }, isUp) {
+  const commands = remedies.flatMap((text) => [...text.matchAll(/doractl (\w+) ([^\s;,]+)([^;,]*)/g)]);
+  const own = commands.filter(([, verb, who, rest]) => DONE_BY[verb] && !rest.includes("--node ")
+    && (who === name || rest.includes(`--name ${name}`)));
+  const found = own.map(([, verb]) => (verb === "restart" && !isUp ? "start" : verb));
+  return [...new Set(found)];
+}
+
 const line = (at, ...parts) => el("li", {}, el("time", {}, clock(at)), " ", ...parts);
 
 export class Why {
-  /** choose: is called with the node whose logs are wanted. */
-  constructor(choose) {
-    this.choose = choose;
+  /** choose: is called with the node whose logs are wanted. ask: with an action. */
+  constructor(choose, ask) {
+    Object.assign(this, { choose, ask });
     this.node = el("section", { class: "panel why", "aria-label": "Why", hidden: true });
   }
 
@@ -67,8 +80,9 @@ export class Why {
     for (const one of this.node.querySelectorAll("ul")) one.scrollTop = one.scrollHeight;
   }
 
-  /** The time goes on, the text stays: somebody may be selecting it. */
-  tick() {
+  /** The time goes on, the text stays: somebody may be selecting it. isFree: whether nobody acts. */
+  tick(isFree) {
+    for (const one of this.node.querySelectorAll("[data-action]")) one.disabled = !isFree;
     if (this.at) this.facts.show("Since", since(this.at));
   }
 
@@ -84,11 +98,19 @@ export class Why {
       list("Where it crashed", "stack", (why.stack ?? []).map((one) =>
         el("li", {}, `${one.function} (${one.place})`))),
       list("What to do", "remedies", why.remedies.map(remedy)),
+      this.#buttons(why, status),
       list(`The last ${last.length === 1 ? "line" : `${last.length} lines`} of ${why.node || "its nodes"}`, "words", last),
       why.node ? el("p", {}, el("button", { type: "button", class: "small",
         onclick: () => this.choose(why.node) }, `All logs of ${why.node}`)) : null,
       list("What happened", "timeline", news),
     ].filter(Boolean);
+  }
+
+  #buttons(why, status) {
+    const actions = actionsOf(why, isUp({ status }));
+    const buttons = actions.map((action, at) => el("button", { type: "button", "data-action": action,
+      class: at ? null : "strong", onclick: () => this.ask(action, "") }, DONE_BY[action][1]));
+    return buttons.length ? el("p", { class: "buttons" }, ...buttons) : null;
   }
 
   #facts(why) {

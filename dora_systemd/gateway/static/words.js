@@ -30,6 +30,13 @@ export function clock(us) {
   return [date.getHours(), date.getMinutes(), date.getSeconds()].map(two).join(":");
 }
 
+/** A time for a field of the type datetime-local. */
+export function local(us) {
+  const date = new Date(us / 1000);
+  const day = [date.getFullYear(), two(date.getMonth() + 1), two(date.getDate())].join("-");
+  return `${day}T${clock(us)}`;
+}
+
 const SPANS = [[86400, "d"], [3600, "h"], [60, "min"], [1, "s"]];
 
 /** A duration in µs by its largest unit, such as "5 min". */
@@ -39,13 +46,32 @@ export function span(us) {
   return `${Math.floor(seconds / size)} ${unit}`;
 }
 
-/** A time in the zone of the reader, and how long ago that is. */
+const FORM = {
+  day: "numeric", month: "short", year: "numeric", hour: "2-digit", minute: "2-digit",
+  second: "2-digit", hourCycle: "h23", timeZoneName: "short",
+};
+
+/** Minutes by which the reader is ahead of UTC at that time. */
+const ahead = (us) => -new Date(us / 1000).getTimezoneOffset();
+
+/** A time of day in UTC, where the reader has another one. */
+function utcWords(us) {
+  if (!ahead(us)) return "";
+  return ` (${new Date(us / 1000).toISOString().slice(11, 19)} UTC)`;
+}
+
+/** A time in the zone of the reader and in UTC, and how long ago that is. */
 export function since(us) {
-  const at = new Date(us / 1000).toLocaleString([], {
-    day: "numeric", month: "short", year: "numeric", hour: "2-digit", minute: "2-digit",
-    second: "2-digit", hourCycle: "h23", timeZoneName: "short",
-  });
-  return `${at}, ${span(Date.now() * 1000 - us)} ago`;
+  const at = new Date(us / 1000).toLocaleString([], FORM);
+  return `${at}${utcWords(us)}, ${span(Date.now() * 1000 - us)} ago`;
+}
+
+/** What times of day on the page are: "times in UTC", "times in UTC+02:00". */
+export function zoneWords() {
+  const minutes = ahead(Date.now() * 1000);
+  const size = Math.abs(minutes);
+  const text = `${minutes < 0 ? "−" : "+"}${two(Math.floor(size / 60))}:${two(size % 60)}`;
+  return `times in UTC${minutes ? text : ""}`;
 }
 
 export const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;

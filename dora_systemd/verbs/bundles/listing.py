@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.adapters.bundles.reader import opened
+from dora_systemd.adapters.bundles.reader import chunks_of, opened
 from dora_systemd.adapters.bundles.store import BundleStore, Stored, unusable
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.bundles.manifest import README, WHY, no_bundle
@@ -46,6 +46,20 @@ def find_name(manager: Manager, scope: Scope, selector: str) -> str:
 def read_bundles(scope: Scope, names: Sequence[str]) -> list[BundleRow]:
     """Read the bundles of these dataflows, the newest of each first."""
     return [_row(name, one) for name in names for one in reversed(store_of(scope, name).known())]
+
+
+def find_bundle(scope: Scope, name: str, ident: str) -> Stored | None:
+    """Find a bundle of the dataflow `name` by the name of its file; None if there is none.
+
+    Raises DoraSystemdError (NO_PERMISSION).
+    """
+    known = store_of(scope, name).known() if name in kept_names(scope) else []
+    return next((one for one in known if one.id == ident), None)
+
+
+def read_parts(one: Stored) -> Iterator[bytes]:
+    """Read a bundle of the store in parts. Raises OSError."""
+    return chunks_of(one.path)
 
 
 def _row(name: str, one: Stored) -> BundleRow:

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,15 @@ import pytest
 
 from dora_systemd.decisions.gateway.page_messages import MAX_ITEMS, MAX_TEXT, PageMessage
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.gateway.live.about import read_about, read_ended, read_own_releases
+from dora_systemd.gateway.live.about import (
+    read_about,
+    read_ended,
+    read_own_bundles,
+    read_own_releases,
+    read_waits,
+)
 from dora_systemd.gateway.live.lines import find_lines
+from dora_systemd.gateway.live.past import SPAN, read_timeline
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.listing import store_of
 from tests.unit.fakes.journal import FakeJournal
@@ -177,3 +185,47 @@ def test_the_releases_of_a_dataflow(bench: Bench) -> None:
     found = read_own_releases(bench.scope, UUID)["releases"]
     assert (len(found), found[0]["release"]) == (MAX_ITEMS, f"2026{MAX_ITEMS + 49:04}T220012")
     assert found[0]["tree"].startswith(f"{bench.root}/x/state/")
+
+
+def test_the_timeline_of_a_dataflow(bench: Bench) -> None:
+    now = time.time_ns() // 1000
+    records = [
+        event("node-crashed", now - 5, node="a", exit="exit code 3"),
+        event("dataflow-starting", now - 9),
+        event("node-crashed", now - SPAN - 10**6, node="a"),
+    ]
+    hostile = json.loads(records[0]) | {"MESSAGE": "Node \x1b[31ma\x1b[0m crashed\x07 <b>"}
+    calls = bench.journal(json.dumps(hostile).encode() + b"\n", *records[1:])
+    found = read_timeline(bench.scope, UUID)
+    (life,) = found["lives"]
+    assert (life["began_us"], life["status"]) == (now - 9, "Failed")
+    (mark,) = found["marks"]
+    assert (mark["kind"], mark["text"]) == ("failure", r"Node a crashed\x07 <b>")
+    assert found["now_us"] - found["since_us"] == SPAN
+    asked = calls.read_text().split()
+    assert {"DORA_EVENT=node-crashed", f"DORA_DATAFLOW={UUID}"} <= set(asked)
+    assert any(one.startswith("--output-fields=MESSAGE,") for one in asked)
+
+
+def test_the_timeline_of_one_that_has_ended(bench: Bench) -> None:
+    now = time.time_ns() // 1000
+    bench.journal(
+        event("dataflow-stopped", now - 1, "arm", GONE),
+        event("dataflow-starting", now - 9, "arm", GONE),
+    )
+    (life,) = read_timeline(bench.scope, GONE)["lives"]
+    assert (life["ended_us"], life["status"]) == (now - 1, "Stopped")
+
+
+def test_the_bundles_of_a_dataflow(bench: Bench) -> None:
+    bench.journal()
+    place = bench.scope.state_root / "dora-systemd/bundles/robot"
+    place.mkdir(parents=True)
+    (place / "robot-20261127T041500Z-requested.tar").write_bytes(b"cut")
+    (found,) = read_own_bundles(bench.scope, UUID)["bundles"]
+    assert (found["bundle"], found["size_bytes"]) == ("robot-20261127T041500Z-requested.tar", 3)
+    assert (found["event"], found["summary"]) == ("requested", None)
+
+
+def test_nobody_waits_in_what_is_down(bench: Bench) -> None:
+    assert read_waits(bench.scope, UUID) == {"waits": [], "remedies": []}

@@ -212,7 +212,7 @@ def test_not_too_much_at_once(systemd: FakeSystemd) -> None:
         for _ in range(MAX_TASKS + 1):
             browser.say(**ACT | {"action": "restart"})
         (problem,) = await browser.wait_for("problem")
-        assert problem["text"] == "cannot start another action: 8 are still running"
+        assert problem["text"] == f"cannot start another action: {MAX_TASKS} are still running"
         assert not await browser.wait_for("acted", 0)
         systemd.finish()
         await browser.wait_for("acted", MAX_TASKS)

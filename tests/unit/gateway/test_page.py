@@ -14,7 +14,7 @@ from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.gateway.routes import DIRECTORY, HEADERS, PREFIX, TYPES, page_routes
 from dora_systemd.scope import Scope
 
-FILES = sorted(DIRECTORY.iterdir())
+FILES = sorted(path for path in DIRECTORY.rglob("*") if path.is_file())
 SCRIPTS = [path for path in FILES if path.suffix == ".js"]
 
 
@@ -27,7 +27,7 @@ def get(path: str) -> Answer:
 
 def test_every_file_has_a_route_and_a_type() -> None:
     assert {path.suffix for path in FILES} <= TYPES.keys()
-    names = {path.name for path in FILES} - {"index.html"}
+    names = {str(path.relative_to(DIRECTORY)) for path in FILES} - {"index.html"}
     assert page_routes().keys() == {"/", *(f"{PREFIX}{name}" for name in names)}
 
 
@@ -69,8 +69,11 @@ def test_the_page_has_no_code_of_its_own() -> None:
 def test_what_is_asked_for_is_there(path: Path) -> None:
     text = path.read_text()
     wanted = re.findall(r'(?:src|href)="(/[^"#]+)"', text)
-    wanted += [f"{PREFIX}{name}" for name in re.findall(r'from "\./([^"]+)"', text)]
-    assert set(wanted) <= page_routes().keys()
+    known = {f"{PREFIX}{one.relative_to(DIRECTORY)}" for one in FILES}
+    for name in re.findall(r'from "([^"]+)"', text):
+        place = (path.parent / name).resolve()
+        wanted.append(f"{PREFIX}{place.relative_to(DIRECTORY.resolve())}")
+    assert set(wanted) <= known & {"/", *page_routes()}
 
 
 def test_the_page_knows_which_dataflows_are_up() -> None:

@@ -11,9 +11,15 @@ LATE = {
     "a list of nothing, or of what has this version's Description=, does without it": {
         "verbs.facts.cells": {"decisions.cell.options"},
     },
-    "the gateway does without it until somebody looks at releases, or rolls back": {
-        "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
-        "gateway.live.actions": {"verbs.releases.listing", "verbs.releases.rollback"},
+    "the gateway does without it until somebody looks at releases or bundles, or rolls back": {
+        "gateway.live.about": {
+            *("decisions.views.releases", "verbs.releases.listing"),
+            *("decisions.bundles.table", "verbs.bundles.listing"),
+        },
+        "gateway.routes": {"verbs.bundles.listing"},
+        "gateway.live.actions": {
+            *("verbs.releases.listing", "verbs.releases.rollback", "verbs.bundles.write"),
+        },
     },
     "a report of what this machine knows reads no bundle": {
         "cli.verbs.look.why": {"verbs.bundles.listing"},

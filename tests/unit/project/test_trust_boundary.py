@@ -60,7 +60,8 @@ _TABLE = {
         adapters.host.process_times
         adapters.host.process_table adapters.host.real_time adapters.host.rights
         runner.cell.restarts trust.socket_table verbs.destroy
-        link.relay verbs.facts.lives verbs.facts.stack verbs.start.programs verbs.start.sandbox
+        link.relay verbs.facts.host verbs.facts.lives verbs.facts.stack verbs.start.programs
+        verbs.start.sandbox
     """,
     ROOTS: """
         adapters.bus.connection adapters.host.unit_files

@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.verbs.bundles.listing import find_name, kept_names, parse_why, shown_readme
+from dora_systemd.verbs.bundles.listing import (
+    find_bundle,
+    find_name,
+    kept_names,
+    parse_why,
+    read_parts,
+    shown_readme,
+)
 from tests.unit.fakes.manager import FakeManager, ScopeIn
 
 
@@ -24,3 +31,25 @@ def test_a_dataflow_is_known_by_its_bundles(scope: ScopeIn, manager: FakeManager
     (scope.state_root / "dora-systemd/bundles/.x").mkdir()
     assert kept_names(scope) == ["robot"]
     assert find_name(manager, scope, "dora-robot.service") == "robot"
+
+
+def test_only_what_the_store_has_is_read(scope: ScopeIn, tmp_path: Path) -> None:
+    store = scope.state_root / "dora-systemd/bundles/robot"
+    store.mkdir(parents=True)
+    known = "robot-20261127T041500Z-requested.tar"
+    link = "robot-20261127T041501Z-requested.tar"
+    (store / known).write_bytes(b"x" * 3_000_000)
+    (store / "secret").write_text("no bundle")
+    (tmp_path / "outside").write_text("secret")
+    (store / link).symlink_to(tmp_path / "outside")
+    found = find_bundle(scope, "robot", known)
+    assert found is not None
+    parts = list(read_parts(found))
+    assert (len(parts) > 1, sum(map(len, parts))) == (True, found.size)
+    wrong = [("robot", "secret"), ("robot", f"../robot/{known}"), ("../bundles/robot", known)]
+    for name, ident in [*wrong, ("", known), ("robot", ""), ("nobody", known)]:
+        assert find_bundle(scope, name, ident) is None
+    followed = find_bundle(scope, "robot", link)
+    assert followed is not None
+    with pytest.raises(OSError):
+        next(read_parts(followed))

@@ -1,14 +1,20 @@
 // The releases of a dataflow, newest first, and the buttons that run another one.
 
-import { arrange, el, say } from "./dom.js";
-import { showState } from "./parts.js";
-import { bytes, plural, since } from "./words.js";
+import { arrange, el, say } from "../dom.js";
+import { showState } from "../parts.js";
+import { bytes, plural, since } from "../words.js";
 
 const TRIAL_LOOKS = 3;
 
 /** What it was made with, as "dora 1.1.0, Python 3.13.5". */
 const versionWords = ({ dora, python }) =>
   [dora && `dora ${dora}`, python && `Python ${python}`].filter(Boolean).join(", ");
+
+/** The directory of a dataflow's file, quoted for a shell if it has to be. */
+function directory(file) {
+  const path = file?.replace(/\/[^/]*$/, "") || ".";
+  return /^[\w./+-]+$/.test(path) ? path : `'${path.replaceAll("'", "'\\''")}'`;
+}
 
 class ReleaseRow {
   constructor(id, ask) {
@@ -42,9 +48,12 @@ export class Releases {
     this.isDue = false;
     this.looks = 0;
     this.list = el("ul", { class: "nodes releases" });
+    this.command = el("code");
+    this.none = el("p", { class: "none-yet" }, "None yet: it runs from its project directory. ",
+      this.command, " copies the project, runs the copy on trial, and can roll back.");
     this.note = el("p", { class: "muted", hidden: true });
     this.node = el("section", { class: "panel", "aria-label": "Releases", hidden: true },
-      el("div", { class: "head" }, el("h2", {}, "Releases")), this.note, this.list);
+      el("div", { class: "head" }, el("h2", {}, "Releases")), this.none, this.note, this.list);
   }
 
   get hasTrial() {
@@ -67,15 +76,18 @@ export class Releases {
     this.#draw();
   }
 
-  /** current: the release that runs, null without any. */
-  show(current, isFree) {
+  /** flow: a row, with the release that it runs, null without any. */
+  show(flow, isFree) {
     this.isFree = isFree;
-    this.isDeployed = Boolean(current);
+    this.isDeployed = Boolean(flow.release);
+    this.node.hidden = Boolean(flow.isEnded || flow.machine);
+    this.none.hidden = this.isDeployed;
+    say(this.command, `doractl deploy ${directory(flow.file)} --name ${flow.name}`);
     this.#draw();
   }
 
   #draw() {
-    this.node.hidden = !this.isDeployed || !(this.known.length || this.note.textContent);
+    if (!this.isDeployed) this.known = [];
     arrange(this.list, this.rows, this.known.map(({ release }) => release), (id) =>
       new ReleaseRow(id, this.ask));
     for (const one of this.known) {

@@ -1,0 +1,225 @@
+"""The past of a dataflow on the status page: its timeline and its bundles."""
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.system.cells import TICK, Cell, Project, journalctl, sync_journal, wait_for
+from tests.system.chromium import Browser
+from tests.system.gateways import Front
+from tests.system.pages import CONTRAST, faults, node
+
+pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
+
+STORE = Path("/var/lib/dora-systemd/bundles")
+LINES = """
+from dora import Node
+for place, event in enumerate(Node()):
+    print("line", place, "<b>bold</b>", flush=True)
+"""
+FLOW = (
+    "nodes:\n"
+    f"  - {{id: shaky, path: lines.py, inputs: {{tick: {TICK}}}, restart_policy: on-failure,"
+    " restart_delay: 0.1, max_restarts: 3}\n"
+)
+THINGS = "[...document.querySelectorAll('.past .thing')].map((e) => e.getAttribute('aria-label'))"
+FOCUSED = "document.activeElement.getAttribute('aria-label')"
+PHONE = (320, 740)
+ALIVE = ("running", "ready")
+KILLED = ("crashed", "restarted", "node_failure", "Signal(9)")
+
+
+@pytest.fixture
+def shaky(cell: Cell, project: Project) -> Iterator[Cell]:
+    """A dataflow whose node has crashed once, and runs again."""
+    project.write("lines.py", LINES)
+    cell.start(project.write("dataflow.yml", FLOW))
+    wait_for("it writes", lambda: "line 5 " in journalctl("-o", "cat", "-u", cell.unit))
+    (pid,) = cell.pids("node-shaky")
+    os.kill(pid, signal.SIGKILL)
+    wait_for("it runs again", lambda: cell.status.nodes["shaky"].restarts == 1)
+    wait_for("it is ready", lambda: cell.status.nodes["shaky"].state in ALIVE)
+    sync_journal()
+    yield cell
+    shutil.rmtree(STORE / cell.name, ignore_errors=True)
+
+
+def marks(browser: Browser, word: str) -> list[str]:
+    """The labels of the things on the axis that have this word."""
+    return [str(one) for one in browser.js(THINGS) if word in one]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.warns(*KILLED)
+def test_what_happened_before_the_page_was_opened(
+    scheme: str, browser: Browser, shaky: Cell, front: Front
+) -> None:
+    browser.prefer(scheme)
+    browser.open(f"http://127.0.0.1:{front.port}/?later#{shaky.status.uuid}")
+    browser.wait_js(f"{THINGS}.some((one) => one.includes('crashed'))")
+    assert marks(browser, "Running, from"), "the life"
+    assert marks(browser, "restarted"), "and that dora has restarted the node"
+    browser.wait_text(".past .legend", "F failure")
+    browser.wait_js("document.querySelector('.past .line.cpu').getAttribute('d') !== ''")
+    # A click shows the log of that moment.
+    browser.fill("#past-range", "0.25")
+    browser.click(".past .thing[data-tone=bad]")
+    browser.wait_js("document.querySelector('#log-time').value === 'range'")
+    browser.wait_text(".logs .found", "found around")
+    browser.wait_text(".lines", "line 5")
+    browser.wait_js("document.querySelector('.lines .moment') !== null")
+    assert browser.js("document.activeElement.className") == "lines"
+    browser.wait_text(".past .chosen", "SIGKILL")
+    browser.wait_text(f"{node('shaky')} .facts", "PID ")
+    browser.wait_text(f"{node('shaky')} .facts", "1 restart of 3")
+    look(browser, f"timeline-{scheme}")
+    browser.resize(*PHONE, is_phone=True)
+    browser.wait_js("document.documentElement.scrollWidth === 320")
+    look(browser, f"timeline-phone-{scheme}")
+    assert browser.failures() == []
+
+
+def look(browser: Browser, name: str) -> None:
+    """A picture, on which everybody can read everything."""
+    assert browser.js(CONTRAST) == []
+    assert faults(browser) == []
+    browser.picture(name, is_whole=True)
+
+
+@pytest.mark.warns(*KILLED)
+@pytest.mark.usefixtures("shaky")
+def test_the_timeline_without_a_pointer(browser: Browser) -> None:
+    browser.wait_js(f"{THINGS}.some((one) => one.includes('crashed'))")
+    reached = browser.js("document.querySelectorAll('.past .thing[tabindex=\"0\"]').length")
+    assert (reached, bool(marks(browser, "Running, from"))) == (1, True)
+    browser.js("document.querySelector('#past-range').focus(), 0")
+    browser.press("Tab")
+    seen = [browser.js(FOCUSED)]
+    for _ in range(10):
+        browser.press("ArrowLeft")
+        seen.append(browser.js(FOCUSED))
+    assert set(seen) == set(browser.js(THINGS)), seen
+    browser.press("End")
+    browser.press("Enter", "\r")
+    browser.wait_js("document.querySelector('#log-time').value === 'range'")
+    browser.wait_text(".logs .found", "found")
+    # The axis moves on, and who is on it stays there.
+    browser.js("document.querySelector('.past .thing[data-tone=bad]').focus(), 0")
+    held = browser.js("document.activeElement.dataset.key")
+    browser.resize(1000, 900)
+    browser.wait_js("document.querySelector('.past svg').getAttribute('width') < 900")
+    assert browser.js("document.activeElement.dataset.key") == held
+    assert browser.failures() == []
+
+
+def test_bundles_are_listed_and_downloaded(
+    browser: Browser, cell: Cell, project: Project, front: Front
+) -> None:
+    cell.start(project.three_nodes())
+    browser.wait_text("section[aria-label=Bundles]", f"doractl bundle {cell.name}")
+    browser.wait_text("section[aria-label=Releases]", f"--name {cell.name}")
+    try:
+        browser.click("#detail [data-action=bundle]")
+        browser.wait_text("#question", f"Write a bundle of {cell.name}?")
+        browser.click("#confirmed")
+        browser.wait_text("#said", "Bundle written", 60)
+        (path,) = (STORE / cell.name).iterdir()
+        browser.wait_text(".bundles", "by root (status page)")
+        sync_journal()
+        browser.open(f"http://127.0.0.1:{front.port}/?later")
+        browser.wait_text(".bundles", path.name)
+        browser.wait_text(".bundles", "requested")
+        link = "document.querySelector('.bundles a')"
+        assert browser.js(f"{link}.getAttribute('download')") == path.name
+        size = browser.js(f"fetch({link}.href).then((a) => a.blob()).then((one) => one.size)")
+        assert size == path.stat().st_size
+        # The same door as that of the page.
+        place = f"/bundles/{cell.name}/{path.name}"
+        assert front.get(place, user="alice").status == 401
+        assert front.get(place, "-H", "Origin: http://elsewhere").status == 403
+        assert front.get(f"/bundles/{cell.name}/../../x").status == 404
+        browser.wait_js(f"{THINGS}.some((one) => one.includes('is written'))")
+        look(browser, "bundles")
+    finally:
+        shutil.rmtree(STORE / cell.name, ignore_errors=True)
+    assert browser.failures() == []
+
+
+FILTERED = """
+import('/page/cards.js').then(({ Filter }) => {
+  const filter = new Filter(() => 0);
+  const flows = [
+    { name: 'arm', status: 'Running', nodes: [{ node: 'camera' }] },
+    { name: 'base', status: 'Failed', nodes: [] },
+  ];
+  return ['', 'CAM', 'fail', 'arm run', 'arm fail'].map((text) => {
+    filter.text.value = text;
+    filter.show(6, 1);
+    return [filter.of(flows).map(({ name }) => name).join(), filter.text.checkVisibility()];
+  });
+})
+"""
+WAITS = """
+import('/page/waits.js').then(({ Waits }) => {
+  let count = 0;
+  const waits = new Waits(() => { count += 1; });
+  const history = (cpu) => ({ of: () => ({ waits: { cpu, io: 7 } }) });
+  waits.show({ uuid: 'u', nodes: [] }, history(12));
+  const few = [waits.node.textContent, count];
+  waits.show({ uuid: 'u', nodes: [] }, history(40));
+  waits.show({ uuid: 'u', nodes: [] }, history(40));
+  waits.take({ waits: ['<b>a</b> waited 40%'], remedies: ['move it'] });
+  return [...few, count, waits.node.textContent, waits.node.querySelectorAll('b').length];
+})
+"""
+ACTIONS = """
+import('/page/why.js').then(({ Why }) => {
+  const asked = [];
+  const why = new Why(() => 0, (action) => asked.push(action));
+  const remedies = REMEDIES;
+  why.show({ why: {
+    name: 'robot', status: 'Failed', summary: 'x', node: '', last_lines: [], timeline: [], remedies,
+    starved: [], restart_history: [], details: {}, at_us: 1,
+  } });
+  for (const one of why.node.querySelectorAll('[data-action]')) one.click();
+  return asked;
+})
+"""
+
+
+def test_many_are_filtered(browser: Browser) -> None:
+    assert browser.js(FILTERED) == [
+        ["arm,base", True],
+        ["arm", True],
+        ["base", True],
+        ["arm", True],
+        ["", True],
+    ]
+
+
+def test_waits_are_explained(browser: Browser) -> None:
+    text, count, more, long, marked = browser.js(WAITS)
+    assert "waited for a CPU 12\xa0% of the time, for a disk 7\xa0%" in text
+    assert (count, more) == (0, 1), "the gateway is asked once, and only for long waits"
+    assert "<b>a</b> waited 40%move it" in long
+    assert marked == 0
+
+
+@pytest.mark.parametrize(
+    ("remedies", "actions"),
+    [
+        ([], []),
+        (["fix a, then run: doractl restart robot"], ["start"]),
+        (["fix a, then run: doractl start /srv/robot/dataflow.yml --name robot"], ["start"]),
+        (["doractl rollback robot; or doractl stop robot does"], ["rollback", "stop"]),
+        (["doractl logs robot --node a", "doractl restart other"], []),
+        (["doractl reload robot --node a"], []),
+    ],
+)
+def test_remedies_are_buttons(browser: Browser, remedies: list[str], actions: list[str]) -> None:
+    assert browser.js(ACTIONS.replace("REMEDIES", json.dumps(remedies))) == actions
