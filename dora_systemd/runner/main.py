@@ -255,14 +255,12 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             notice=reloader.notice,
             is_attached=options.attached,
             stops=stops,
-            stop_limit=options.of_dataflow("stop_limit") if stops else 0,
+            stop_limit=options.of_dataflow("stop_limit") if stops or options.machine else 0,
         )
         pump = Pump(role.cell(cell), runs.this_life, runs.paths, runs.nodes, runs.pipes)
         dialogue = role.dialogue(options, pump, dora, runs.nodes, runs.pipes)
-        if stops:
-            from dora_systemd.runner.cell.node_stops import NodeStops
-
-            pump.on_node = NodeStops(pump, dora, runs.nodes, dialogue).perform
+        if stops or options.machine:
+            pump.on_node = role.node_stops(pump, dora, runs.nodes, dialogue).perform
         variables = daemon_variables(own, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
         if options.has("on_failure") and (file := request_file(os.environ)):

@@ -122,23 +122,16 @@ def total(stops: Stops, grace: int) -> int:
     return max([kill_time(grace, grace), *rows])
 
 
-def check_stops(
-    stops: Collection[NodeStop], limit: int, grace: int, nodes: Iterable[str], machines: bool
-) -> None:
+def check_stops(stops: Collection[NodeStop], limit: int, grace: int, nodes: Iterable[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a stop that no dataflow of these `nodes` can have.
 
-    limit: µs for the whole stop. machines: whether nodes run on several machines.
+    limit: µs for the whole stop.
     """
     if not stops:
         return
     known, by_node = list(nodes), {one.node: one for one in stops}
     for one in stops:
         check_known(f"cannot stop {one.node} after", one.after, known)
-    if machines:
-        message = (
-            f"cannot set the stop of the node {next(iter(by_node))}: the dataflow has machines"
-        )
-        raise _impossible(message, "remove stop:, which works on one machine only")
     _check_order(by_node)
     _check_time(by_node, limit, grace)
 

@@ -280,6 +280,7 @@ class MachineLost(Event):
     by: str = ""  # the user who stopped its part on that machine, or ""
     # whether its part has failed, while the machine and the way to it are well
     is_failure: bool = False
+    is_waiting: bool = False  # its nodes still run, and wait for the head to stop them
 
 
 @dataclass(frozen=True)
@@ -287,6 +288,17 @@ class HeadStops(Event):
     """To a member: the head has dora stop all nodes."""
 
     by: str  # who requested the stop of the head
+    # µs if the nodes have an order: each is stopped by a NodeTurn, and a second HeadStops without a
+    # limit follows when no machine has a node any more
+    limit: int = 0
+
+
+@dataclass(frozen=True)
+class NodeTurn(Event):
+    """To a member: in the order of a stop it is the turn of a node there."""
+
+    node: str
+    within: int  # µs until SIGTERM
 
 
 @dataclass(frozen=True)

@@ -152,18 +152,16 @@ def _stopping(event: life.StopAsked) -> Record:
 def node_event_stopping(cell: Cell, event: life.Event) -> Next:
     """Record a node event while stopping; dismiss the daemon after the last node has exited."""
     cell, actions = node_event(cell, event)
-    if table.has_process(cell.nodes):
-        return _advance(cell, *actions)
+    return go_on(cell, *actions)
+
+
+def go_on(cell: Cell, *actions: Action) -> Next:
+    """Stop the next nodes, if the stop has an order; dismiss the daemon if none is left."""
+    if table.has_process(cell.nodes) or cell.awaits_head:
+        cell, stops = stop_order.advance(cell)
+        return cell, (*actions, *stops)
     # Do not wait for the answer to Stop: dora sends none while a node is in its restart delay.
     return _leave(cell, *actions)
-
-
-def _advance(cell: Cell, *actions: Action) -> Next:
-    """Stop the next nodes, if the stop has an order."""
-    if not stop_order.has_order(cell):
-        return cell, actions
-    cell, stops = stop_order.advance(cell)
-    return cell, (*actions, *stops)
 
 
 def _leave(cell: Cell, *actions: Action) -> Next:
@@ -188,7 +186,14 @@ def wind_down(cell: Cell, *actions: Action) -> Next:
         cell, stops = stop_order.advance(cell)
         after = cell.stop_limit + ANSWER_MARGIN
         return to(cell, State.STOPPING, *actions, *stops, after=after)
-    return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
+    return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=time_alone(cell))
+
+
+def time_alone(cell: Cell) -> int:
+    """µs for the end of the nodes without an order. On a member each may have a time of its own."""
+    if cell.machine and cell.stops and cell.ready_us:
+        return cell.stop_limit + ANSWER_MARGIN
+    return stop_timeout(cell.grace)
 
 
 def stop_again(cell: Cell, event: life.StopAsked) -> Next:
@@ -196,6 +201,8 @@ def stop_again(cell: Cell, event: life.StopAsked) -> Next:
 
     stop_by is empty while a reload or a failed trial stops the nodes.
     """
+    if cell.awaits_head and not cell.stop_us:  # the machine of this member shuts down meanwhile
+        return replace(cell, stop_us=event.at_us), ()
     if cell.stop_by:
         return _leave(cell)
     return replace(cell, stop_by=event.by, reload=False), (_stopping(event),)

@@ -1,10 +1,12 @@
 """Handlers of events that only a dataflow with several machines has, see handlers.py.
 
 A lost machine is a lost run: dora cannot continue without one of its daemons, and a Stop then takes
-half a minute. So each machine ends its own nodes. With a restart policy the head waits for the
-machine, and starts the next run in the same process: a restart by systemd would use up
-StartLimitBurst=, and lengthen the delay of the next restart. The failure of a part is a failure of
-the dataflow, which systemd restarts.
+half a minute. So each machine ends its own nodes. If the stop has an order, the head keeps it for
+the machines that are left: dora stops single nodes of these.
+
+With a restart policy the head waits for the machine, and starts the next run in the same process: a
+restart by systemd would use up StartLimitBurst=, and lengthen the delay of the next restart. The
+failure of a part is a failure of the dataflow, which systemd restarts.
 """
 
 from dataclasses import replace
@@ -13,6 +15,7 @@ from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import handlers as handle
 from dora_systemd.decisions.life import node_table as table
+from dora_systemd.decisions.life import stop_order
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import (
     ENGINE_TIMEOUT,
@@ -22,8 +25,16 @@ from dora_systemd.decisions.life.failures import (
     fail,
     to,
 )
-from dora_systemd.decisions.life.states import Action, Cell, Do, Record, RunnerExit, State
-from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.decisions.life.states import (
+    Action,
+    Cell,
+    Deadline,
+    Do,
+    Record,
+    RunnerExit,
+    State,
+)
+from dora_systemd.decisions.life.stop_budget import ANSWER_MARGIN, LEAVE_TIMEOUT, stop_timeout
 from dora_systemd.values import SECOND
 
 _ENDED = ("failed", "finished", "stopped", "dynamic")
@@ -98,7 +109,19 @@ def machine_lost(cell: Cell, event: life.MachineLost) -> Next:
         cell = because(cell, Cause.MACHINE_LOST)
         failure = f"machine {event.machine}: {event.reason}"
         cell = replace(cell, failure=failure, exit=RunnerExit.ENGINE_LOST)
-    return _end_nodes(cell, event, _lost(event.machine, event.reason))
+    return _without_machine(cell, event)
+
+
+def _without_machine(cell: Cell, event: life.MachineLost) -> Next:
+    """End the nodes, in their order if they have one."""
+    lost = _lost(event.machine, event.reason)
+    if not stop_order.has_order(cell):
+        return _end_nodes(cell, event, lost)
+    if not event.is_waiting:
+        cell = replace(cell, nodes=_without_others(cell, event.at_us, event.machine))
+    if cell.state is State.STOPPING:  # its deadline holds
+        return handle.go_on(cell, lost)
+    return handle.wind_down(cell, lost)
 
 
 def _stopped_there(cell: Cell, event: life.MachineLost) -> Cell:
@@ -108,24 +131,26 @@ def _stopped_there(cell: Cell, event: life.MachineLost) -> Cell:
 
 
 def machine_lost_stopping(cell: Cell, event: life.MachineLost) -> Next:
-    """End the nodes without dora, which would wait for the lost member during its stop."""
+    """End the nodes without the lost member, for which dora would wait during its stop."""
     if not any(
         cell.nodes[node].machine == event.machine for node in table.with_process(cell.nodes)
     ):
         return cell, ()
-    return _end_nodes(cell, event, _lost(event.machine, event.reason))
+    return _without_machine(cell, event)
 
 
 def _end_nodes(cell: Cell, event: life.Event, *actions: Action) -> Next:
     """End the nodes of this machine without dora; other machines end their own nodes."""
     cell = replace(cell, nodes=_without_others(cell, event.at_us))
-    return to(cell, State.STOPPING, *actions, Do.END_NODES, after=stop_timeout(cell.grace))
+    after = handle.time_alone(cell)
+    return to(replace(cell, awaits_head=False), State.STOPPING, *actions, Do.END_NODES, after=after)
 
 
-def _without_others(cell: Cell, at_us: int) -> table.NodeTable:
+def _without_others(cell: Cell, at_us: int, machine: str = "") -> table.NodeTable:
+    """Mark the nodes of `machine`, or of all others, as stopped."""
     return {
         ident: node._replace(state="stopped", since_us=at_us)
-        if node.machine and node.state not in _ENDED
+        if node.machine and machine in ("", node.machine) and node.state not in _ENDED
         else node
         for ident, node in cell.nodes.items()
     }
@@ -134,9 +159,28 @@ def _without_others(cell: Cell, at_us: int) -> table.NodeTable:
 def head_stops(cell: Cell, event: life.HeadStops) -> Next:
     """Wait for the nodes to end, which dora stops at the request of the head."""
     cell = replace(cell, stop_by=event.by)
+    if event.limit:
+        return _await_head(cell, event.limit, _stopping(event.by))
     if not table.has_process(cell.nodes):
         return handle.wind_down(cell, _stopping(event.by))
     return to(cell, State.STOPPING, _stopping(event.by), after=stop_timeout(cell.grace))
+
+
+def _await_head(cell: Cell, limit: int, *actions: Action) -> Next:
+    """Keep the daemon until no machine has a node: the last messages of nodes here may be on it."""
+    cell = replace(cell, awaits_head=True, stop_limit=limit)
+    return to(cell, State.STOPPING, *actions, after=limit + 2 * ANSWER_MARGIN)
+
+
+def head_stops_again(cell: Cell, event: life.HeadStops) -> Next:
+    """Stop the nodes in the order of the head, or leave, because no machine has a node."""
+    if event.limit:
+        return _await_head(cell, event.limit)
+    if not cell.awaits_head:
+        return cell, ()
+    cell, actions = handle.go_on(replace(cell, awaits_head=False))
+    # The head does not wait any more, or its event of the last exit was faster.
+    return cell, actions or (Deadline(LEAVE_TIMEOUT),)
 
 
 def head_lost(cell: Cell, event: life.HeadLost) -> Next:

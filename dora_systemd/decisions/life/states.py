@@ -147,4 +147,5 @@ class Cell:
     stops: "Stops" = field(default_factory=dict)
     stop_limit: int = 0
     ending: Mapping[str, StopStep] = field(default_factory=dict)
+    awaits_head: bool = False  # whether this member stops each node when the head requests that
     early: tuple[str, ...] = ()  # nodes that ended before they called dora, and will not restart

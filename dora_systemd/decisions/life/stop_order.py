@@ -5,6 +5,10 @@ its time it gets SIGTERM, and SIGKILL half a grace duration later, as from dora.
 time with EXTEND_TIMEOUT_USEC=, as far as `stop_limit` leaves the later nodes their time.
 
 A stop before all nodes were ready has no order: dora would fail a node whose message is early.
+
+With several machines the head has the order. A member stops a node when the head requests that,
+and measures the time of the node. What ends a node without dora has no order: see
+machines.py.
 """
 
 from dataclasses import replace
@@ -29,13 +33,22 @@ _NOT_AWAITED = ("restarting", "dynamic")
 
 def has_order(cell: Cell) -> bool:
     """Whether the stop of this cell has an order."""
-    return bool(cell.stops) and cell.ready_us > 0
+    return bool(cell.stops) and cell.ready_us > 0 and not cell.machine
+
+
+def take_turn(cell: Cell, event: life.NodeTurn) -> Next:
+    """Stop a node of this member, because the head requests that."""
+    status = cell.nodes.get(event.node)
+    if status is None or event.node in cell.ending or _is_over(status):
+        return cell, ()
+    cell = replace(cell, ending={**cell.ending, event.node: StopStep.STOPPED})
+    return cell, (StopNode(event.node, event.within),)
 
 
 def advance(cell: Cell) -> Next:
     """Stop the nodes whose turn it is."""
     due = [node for node in cell.nodes if _is_due(cell, node)]
-    if not due:
+    if not due or not has_order(cell):
         return cell, ()
     ending = {**cell.ending, **dict.fromkeys(due, StopStep.STOPPED)}
     return replace(cell, ending=ending), tuple(_stop(cell, node) for node in due)
@@ -82,9 +95,14 @@ def extend(cell: Cell, event: life.NodeExtends) -> Next:
     stop = cell.stops.get(event.node)
     if not (stop and stop.within) or cell.ending.get(event.node) is not StopStep.STOPPED:
         return cell, ()
-    tail = tails(cell.stops, cell.grace).get(event.node, 0)
-    most = cell.stop_limit - tail - cell.grace // 2 - event.passed_us
+    most = most_time(cell, event.node, event.passed_us)
     return cell, (GiveTime(event.node, min(event.wanted, most)),) if most > 0 else ()
+
+
+def most_time(cell: Cell, node: str, passed: int) -> int:
+    """µs until SIGTERM that a node may have now at most. passed: µs since the stop began."""
+    tail = tails(cell.stops, cell.grace).get(node, 0)
+    return cell.stop_limit - tail - cell.grace // 2 - passed
 
 
 def in_turn(cell: Cell) -> tuple[list[str], list[str]]:

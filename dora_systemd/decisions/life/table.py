@@ -83,6 +83,8 @@ _STOPPING: dict[str, Handler] = {
     "StopAsked": handle.stop_again,
     "NodeOverdue": stop_order.overdue,
     "NodeExtends": stop_order.extend,
+    "NodeTurn": stop_order.take_turn,
+    "HeadStops": machines.head_stops_again,
     "MachineLost": machines.machine_lost_stopping,
     "HeadLost": machines.head_lost_stopping,
 }

@@ -66,7 +66,7 @@ def _format_stopping(cell: Cell) -> str:
     left = [ident for ident, node in cell.nodes.items() if node.state in WITH_PROCESS]
     if not left:
         return "stopping"
-    if has_order(cell):
+    if has_order(cell) or cell.ending:
         now, later = in_turn(cell)
         return f"stopping, waiting for {_names(now)}" + (f", then {_names(later)}" if later else "")
     text = f"stopping, waiting for {_names(left)}"

@@ -92,7 +92,14 @@ def merged(table: CellStatus, others: Mapping[str, CellStatus]) -> CellStatus:
     said = {node: parse_sign(one.signs[node]) for node, one in away.items() if node in one.signs}
     signs = {**table.signs, **{node: (one.status, 0, 0) for node, one in said.items()}}
     usage = {node: one.usage[node] for node, one in away.items() if parse_use(one.usage.get(node))}
-    return table._replace(nodes=nodes, lines={**table.lines, **lines}, usage=usage, signs=signs)
+    dues = {node: one.stop_dues[node] for node, one in away.items() if node in one.stop_dues}
+    return table._replace(
+        nodes=nodes,
+        lines={**table.lines, **lines},
+        usage=usage,
+        signs=signs,
+        stop_dues={**table.stop_dues, **dues},
+    )
 
 
 def _told(ident: str, node: NodeStatus, others: Mapping[str, CellStatus]) -> NodeStatus:

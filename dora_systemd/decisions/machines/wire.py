@@ -138,6 +138,7 @@ class Ended:
     by: str = ""  # who requested the end, or ""
     # 1 if its part has failed by itself; 0 also if its machine shuts down, or it has lost the head
     failed: int = 0
+    waits: int = 0  # 1 if its nodes run until the head stops them in their order, for a moment
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,16 @@ class Stopping:
     """Head to member: the head is about to have dora stop all nodes."""
 
     by: str = ""  # who requested that
+    limit: int = 0  # as of HeadStops
+
+
+@dataclass(frozen=True)
+class StopNode:
+    """Head to member: in the order of a stop it is the turn of a node there."""
+
+    node: str
+    within: int  # µs until SIGTERM
+    most: int  # µs until SIGTERM if the node extends its time
 
 
 RUNNER_ENDED = "its supervisor process has ended"
@@ -196,6 +207,7 @@ Message = (
     | Ended
     | StopPart
     | Stopping
+    | StopNode
     | Asked
     | Check
     | Checked
@@ -217,12 +229,16 @@ _TYPES: Mapping[str, type[Any]] = {
     "ended": Ended,
     "stop": StopPart,
     "stopping": Stopping,
+    "stop-node": StopNode,
     "asked": Asked,
     "check": Check,
     "checked": Checked,
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
-_NUMBERS = {"coordinator", "zenoh", "grace", "again", "version", "tries", "failed"}
+_NUMBERS = {
+    *("coordinator", "zenoh", "grace", "again", "version", "tries"),
+    *("failed", "waits", "limit", "within", "most"),
+}
 _LONG = {"status", "digests"}
 _BY_MACHINE = {(Forwards, "zenoh")}
 

@@ -33,8 +33,7 @@ def _parse(value: Any, _: Base) -> NodeStop:
 
 def _check(options: RunnerOptions, nodes: Sequence[Node]) -> None:
     stops, limit = named_stops(options.by_node("stop")), options.of_dataflow("stop_limit")
-    is_apart = bool(options.placed)
-    check_stops(stops.values(), limit, options.grace, [node.id for node in nodes], is_apart)
+    check_stops(stops.values(), limit, options.grace, [node.id for node in nodes])
     check_sockets(options, nodes)
 
 
@@ -49,6 +48,7 @@ STOP = Setting[NodeStop | None](
     None,
     "Time that the node has to stop, and the nodes that stop before it.",
     only_nodes=True,
+    on_head=True,
     check=_check,
 )
 STOP_LIMIT = Setting[int](

@@ -26,6 +26,7 @@ from dora_systemd.runner.nodes.nodes import Nodes
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
     from dora_systemd.adapters.runner_socket.door import Door
+    from dora_systemd.runner.cell.node_stops import NodeStops
 
 
 class Alone:
@@ -101,3 +102,10 @@ class Alone:
     ) -> Dialogue:
         """Return the Dialogue that carries out the actions of the run."""
         return Dialogue(options, pump, dora, nodes, pipes)
+
+    def node_stops(self, pump: Pump, dora: Engine, nodes: Nodes, dialogue: Dialogue) -> "NodeStops":
+        """Return what carries out a stop that has an order."""
+        # Imported late: few dataflows have one.
+        from dora_systemd.runner.cell.node_stops import NodeStops
+
+        return NodeStops(pump, dora, nodes, dialogue)

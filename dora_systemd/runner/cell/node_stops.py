@@ -20,7 +20,7 @@ from dora_systemd.runner.cell.failure import Tasks
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.watchdog import monotonic_us
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 
 MonotonicUs = Callable[[], int]
 _ENDLESS = 2**62
@@ -43,6 +43,7 @@ class NodeStops:
         self._loop = asyncio.get_running_loop()
         self._began_us: int | None = None
         self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._ends_us: dict[str, int] = {}
         nodes.stop_dues.clear()  # of the run before
         if nodes.notify_sockets:
             nodes.notify_sockets.on_extend = self.extend
@@ -61,10 +62,12 @@ class NodeStops:
         if not isinstance(action, GiveTime):  # that can come very often
             self._pump.refresh()
 
-    def _begin(self) -> None:
+    def _begin(self) -> int:
+        """Return when the stop has begun, by CLOCK_MONOTONIC."""
         if self._began_us is None:
             self._began_us = self._clock_us()
             self._nodes.let_go()
+        return self._began_us
 
     async def _stop(self, node: str) -> None:
         cell = self._pump.cell
@@ -104,8 +107,13 @@ class NodeStops:
     def _overdue(self, node: str) -> None:
         self._pump.push(life.NodeOverdue(now_us(), node))
 
+    def bound(self, node: str, most: int) -> None:
+        """Let a node extend its time to `most` µs from now, but no more: others wait for it."""
+        self._ends_us[node] = self._clock_us() + most
+
     def extend(self, node: str, wanted: int) -> None:
         """Report that a node extends its time, if the stop has begun."""
         if self._began_us is not None and self._pump.cell.state is State.STOPPING:
             passed = self._clock_us() - self._began_us
+            wanted = min(wanted, self._ends_us.get(node, INFINITY) - self._clock_us())
             self._pump.push(life.NodeExtends(now_us(), node, wanted, passed))

@@ -33,14 +33,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.node_table import with_process
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.machines.part import (
-    check_placed,
-    differing,
-    format_differing,
-    is_here,
-    parse_digests,
-    with_works,
-)
+from dora_systemd.decisions.machines.part import check_placed, format_differing, is_here, with_works
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
@@ -56,12 +49,13 @@ from dora_systemd.runner.machines.boot import (
     shared_environment,
 )
 from dora_systemd.runner.machines.roster import Roster, find_unreached
-from dora_systemd.runner.machines.shared import NOISE, Shared, SharedEngine, end_nodes, read_digests
+from dora_systemd.runner.machines.shared import NOISE, Shared, SharedEngine, end_nodes, find_others
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
+    from dora_systemd.runner.machines.order import SpreadStops
 
 FIRST_PATIENCE = 30 * SECOND
 """µs that a start by hand waits for members if the settings have no timeout."""
@@ -175,6 +169,15 @@ class Head(Shared):
         pump.amend = self.roster.amend
         return HeadDialogue(options, pump, dora, nodes, pipes, self.roster)
 
+    def node_stops(
+        self, pump: Pump, dora: Engine, nodes: Nodes, dialogue: Dialogue
+    ) -> "SpreadStops":
+        """Return what carries out a stop that has an order, on all machines."""
+        from dora_systemd.runner.machines.order import SpreadStops
+
+        assert isinstance(dialogue, HeadDialogue)
+        return SpreadStops(pump, dora, nodes, dialogue, self.roster, dialogue.lose_silent)
+
 
 class HeadDialogue(Dialogue):
     """Carries out each Do of a head."""
@@ -201,13 +204,8 @@ class HeadDialogue(Dialogue):
 
     async def _look_at(self, machine: str, told: str) -> None:
         """Report the files that differ between a member and the head: no restart copies them."""
-        try:
-            there = parse_digests(told)
-        except (ValueError, RecursionError):
-            return
-        root = Path(self._options.dataflow).parent
-        here = await asyncio.to_thread(read_digests, root, there)
-        self._differing[machine] = found = differing(here, there)
+        found = await find_others(Path(self._options.dataflow).parent, told)
+        self._differing[machine] = found
         if not found:
             return
         notice = format_differing(self._differing)
@@ -365,8 +363,8 @@ class HeadDialogue(Dialogue):
         self.spawn("see whether a machine falls silent", self._watch_silence())
         await super()._ask_stop()
 
-    def _lose_silent(self) -> bool:
-        """End the nodes without dora if a machine with nodes falls silent."""
+    def lose_silent(self) -> bool:
+        """Report the loss of a machine with nodes that falls silent during a stop."""
         nodes = self._pump.cell.nodes
         needed = {nodes[node].machine for node in with_process(nodes)}
         if silent := next((name for name in self._roster.silent() if name in needed), ""):
@@ -374,7 +372,7 @@ class HeadDialogue(Dialogue):
         return bool(silent)
 
     async def _watch_silence(self) -> None:
-        while self._pump.cell.state is State.STOPPING and not self._lose_silent():
+        while self._pump.cell.state is State.STOPPING and not self.lose_silent():
             await asyncio.sleep(_LOOK_SECONDS)
 
     def _begin_end(self) -> float:

@@ -40,6 +40,7 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.node_stops import NodeStops
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.cell.restarts import Life
 from dora_systemd.runner.machines.boot import MemberBoot, no_head, shared_environment
@@ -53,6 +54,7 @@ from dora_systemd.runner.machines.shared import (
     read_digests,
 )
 from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.runner.nodes.watchdog import monotonic_us
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import INFINITY
 
@@ -95,6 +97,12 @@ class Uses:
         return {node: told_use(use, table.samples, now, node) for node, use in uses.items()}
 
 
+def with_left(table: CellStatus, now: int) -> CellStatus:
+    """Return the table with the time that is left in stop_dues: the head has another clock."""
+    left = {node: max(due - now, 0) for node, due in table.stop_dues.items()}
+    return table._replace(stop_dues=left)
+
+
 class Member(Shared):
     """The role of a member. take_over: returns the connection to the head."""
 
@@ -113,12 +121,14 @@ class Member(Shared):
         self._lines: Lines | None = None
         self._dora: MemberEngine | None = None
         self._pump: Pump | None = None
-        self._table = self._told = self._version = ""
+        self._told = self._version = ""
+        self._table: CellStatus | None = None
+        self._stops: NodeStops | None = None
         self._prepared: Prepared | None = None
         self._environment: Mapping[str, str] = {}
         self._spawn: Callable[[str, Coroutine[Any, Any, None]], None] | None = None
         self._has_head = asyncio.Event()
-        self.stops_by_head = False
+        self.stops_by_head = self.has_order = False
         self.grace = INFINITY
         self.is_answered = asyncio.Event()
         self.is_going_down: Callable[[bool], bool] = is_going_down
@@ -161,8 +171,13 @@ class Member(Shared):
         dialogue.spawn("report what its nodes run", self._tell_programs())
         return dialogue
 
+    def node_stops(self, pump: Pump, dora: Engine, nodes: Nodes, dialogue: Dialogue) -> NodeStops:
+        """Return what stops the nodes here in the order of the head."""
+        self._stops = NodeStops(pump, dora, nodes, dialogue)
+        return self._stops
+
     def _note_table(self, uses: Uses, table: CellStatus) -> CellStatus:
-        self._table = uses.added(table).to_json()
+        self._table = uses.added(table)
         return table
 
     async def _tell_programs(self) -> None:
@@ -182,9 +197,10 @@ class Member(Shared):
 
     def _send_table(self) -> None:
         """Send the table, if it has changed since the last heartbeat."""
-        if self._table != self._told and len(self._table) < wire.MAX_LINE // 2:
-            self._told = self._table
-            self.send(wire.Table(self._table))
+        table = with_left(self._table, monotonic_us()).to_json() if self._table else ""
+        if table != self._told and len(table) < wire.MAX_LINE // 2:
+            self._told = table
+            self.send(wire.Table(table))
 
     def send(self, message: wire.Message) -> None:
         """Send a message to the head, if the head is connected."""
@@ -218,9 +234,8 @@ class Member(Shared):
         return "" if own == other else f"it has dora {self._version}, the head has {there}"
 
     def _hear(self, message: wire.Message) -> None:
-        if isinstance(message, wire.Stopping):
-            self.stops_by_head = True
-            self._push(life.HeadStops(now_us(), message.by or HEAD))
+        if isinstance(message, wire.Stopping | wire.StopNode):
+            self._stop_in_order(message)
         if isinstance(message, wire.Asked) and message.what in (RESTART, STOP):
             self._push(life.NodeAsked(now_us(), message.node, message.what, message.by))
         if isinstance(message, wire.Check) and self._spawn is not None:
@@ -228,6 +243,18 @@ class Member(Shared):
         if isinstance(message, wire.StopPart):
             self.grace = message.grace
             self._end_by_head("the head has lost another machine")
+
+    def _stop_in_order(self, message: wire.Stopping | wire.StopNode) -> None:
+        """Stop all nodes, or the one whose turn it is."""
+        if isinstance(message, wire.Stopping):
+            self.stops_by_head = True
+            if message.limit:
+                self.has_order = True
+                self.is_answered.set()
+            self._push(life.HeadStops(now_us(), message.by or HEAD, message.limit))
+        elif self._stops is not None:
+            self._stops.bound(message.node, message.most)
+            self._push(life.NodeTurn(now_us(), message.node, message.within))
 
     async def _answer_check(self, digest: str) -> None:
         error = await asyncio.to_thread(self._find_refusal, digest)

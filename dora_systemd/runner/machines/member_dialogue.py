@@ -12,14 +12,15 @@ from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Do, State
+from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import is_here
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.machines.shared import MemberEngine, end_nodes
+from dora_systemd.runner.machines.shared import MemberEngine, Patience, end_nodes
 from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.runner.nodes.watchdog import monotonic_us
 from dora_systemd.values import SECOND
 
 _POLL_SECONDS, _SOON, _LATER_SECONDS = 0.05, 200, 0.5
@@ -41,6 +42,7 @@ class Voice(Protocol):
     stops_by_head: bool  # the head knows that this part ends
     grace: int  # µs that the head leaves the nodes
     is_answered: asyncio.Event  # the head ends its own part, or is gone
+    has_order: bool  # the head stops the nodes of this machine one by one
     is_going_down: Callable[[bool], bool]  # whether the machine, or the user's manager, shuts down
 
     def send(self, message: wire.Message) -> None:
@@ -130,7 +132,8 @@ class MemberDialogue(Dialogue):
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_ANSWER_SECONDS):
                 await self._voice.is_answered.wait()
-        await self._end_nodes()
+        if not self._voice.has_order:
+            await self._end_nodes()
 
     def _is_going_down(self) -> bool:
         return self._voice.is_going_down(self._nodes.places[1].is_of_user)
@@ -149,7 +152,8 @@ class MemberDialogue(Dialogue):
         cell = self._pump.cell
         self._pipes.mute("daemon")  # it does not know that we end them
         grace = min(cell.grace, self._voice.grace)
-        await end_nodes(self._nodes, list(cell.nodes), grace / SECOND)
+        apart = times_left(cell, self._nodes.stop_dues, monotonic_us())
+        await end_nodes(self._nodes, list(cell.nodes), grace / SECOND, apart)
         self._pump.push(life.StopAnswered(now_us()))
 
     def _exit(self, leave: Callable[[], None]) -> None:
@@ -166,9 +170,26 @@ class MemberDialogue(Dialogue):
             self._voice.send(wire.Ended())
         elif cell.stop_by:
             reason, by = (_GOING_DOWN, "") if is_going_down() else ("", cell.stop_by)
-            self._voice.send(wire.Ended(reason, by))
+            self._voice.send(wire.Ended(reason, by, waits=int(cell.state is State.STOPPING)))
         else:
             self._voice.send(wire.Ended(cell.failure, failed=int(bool(cell.failure))))
+
+
+def times_left(cell: Cell, dues: Mapping[str, int], now: int) -> dict[str, Patience]:
+    """Return the time of the nodes that have one of their own. dues: of those that are stopping.
+
+    A node that dora has stopped already gets no SIGTERM before its time is over. For any other
+    SIGTERM is the stop: the end of the daemon is no event for a node. Before all nodes were ready
+    no node has data to save.
+    """
+    own = {node: one.within for node, one in cell.stops.items() if one.within and cell.ready_us}
+    half = cell.grace / 2 / SECOND
+    return {
+        node: Patience(max(dues[node] - now, 0) / SECOND, half)
+        if node in dues
+        else Patience(0.0, within / SECOND)
+        for node, within in own.items()
+    }
 
 
 def is_going_down(is_of_user: bool) -> bool:

@@ -30,6 +30,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.machines.boot import GREETED, forwards
 from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.nodes.watchdog import monotonic_us
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import quoted
 
@@ -45,6 +46,8 @@ _LOOK_SECONDS = 0.02
 _CHECK_SECONDS = 30.0
 """Time for a member to check its part: its dora may have to read the descriptor."""
 _CONNECT_SECONDS = 3.0
+_ENDLESS = 2**62
+"""µs."""
 
 Endpoints = Mapping[str, tuple[str, int]]
 """Address and port by machine."""
@@ -77,6 +80,15 @@ def _refusal(name: str, member: Member) -> DoraSystemdError | None:
     reason = "it does not answer" if member.work else member.words
     message = f"cannot reach machine {name}: {reason}"
     return DoraSystemdError(message, "a start would wait for that machine", ExitCode.NO_HOST)
+
+
+def with_dues(table: CellStatus) -> CellStatus:
+    """The table of a member, whose clock has another zero: it sends the time that is left.
+
+    The table of the head must not get a number that no reader accepts.
+    """
+    now, left = monotonic_us(), table.stop_dues.items()
+    return table._replace(stop_dues={node: now + one for node, one in left if one < _ENDLESS})
 
 
 class Roster:
@@ -144,10 +156,10 @@ class Roster:
         """Return the members that may be gone."""
         return [name for name, one in self._members.items() if not one.is_heard]
 
-    def tell(self, message: wire.Message) -> None:
-        """Send a message to all connected members."""
-        for one in self._members.values():
-            if one.lines is not None:
+    def tell(self, message: wire.Message, machine: str = "") -> None:
+        """Send a message to all connected members, or to the one with that name."""
+        for name, one in self._members.items():
+            if one.lines is not None and machine in ("", name):
                 one.lines.send(message)
 
     async def find_refusal(
@@ -242,7 +254,7 @@ class Roster:
         if isinstance(message, wire.Ready):
             self._ready(name, message)
         elif isinstance(message, wire.Table):
-            self._members[name].table = CellStatus.from_json(message.status)
+            self._members[name].table = with_dues(CellStatus.from_json(message.status))
             self._refresh_soon()
         elif isinstance(message, wire.Programs | wire.Hung | wire.Checked):
             self._hear_of_files_and_nodes(name, message)
@@ -329,7 +341,8 @@ class Roster:
         was_ready, member.work, member.is_over = bool(member.work), "", True
         member.words = reason or f"it was stopped there by {by}"
         if was_ready or by:
-            self.push(life.MachineLost(now_us(), name, member.words, by, bool(message.failed)))
+            facts = member.words, by, bool(message.failed), bool(message.waits)
+            self.push(life.MachineLost(now_us(), name, *facts))
         self.changed.set()
 
 

@@ -7,13 +7,21 @@ import os
 import signal
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import protocol
-from dora_systemd.decisions.machines.part import MOST_FILES, is_here, own_dataflow, own_options
+from dora_systemd.decisions.machines.part import (
+    MOST_FILES,
+    differing,
+    is_here,
+    own_dataflow,
+    own_options,
+    parse_digests,
+)
 from dora_systemd.decisions.machines.wire import Part
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.begin import Daemon
@@ -126,6 +134,15 @@ def read_digests(root: Path, paths: Iterable[str]) -> dict[str, str]:
     return {path: one for path, one in found.items() if one}
 
 
+async def find_others(root: Path, told: str) -> list[str]:
+    """Find the files below `root` that a member, whose Programs has `told`, has otherwise."""
+    try:
+        there = parse_digests(told)
+    except (ValueError, RecursionError):
+        return []
+    return differing(await asyncio.to_thread(read_digests, root, there), there)
+
+
 def _digest(path: Path) -> str:
     try:
         data = read_regular(path, _MOST_BYTES + 1)
@@ -137,11 +154,22 @@ def _digest(path: Path) -> str:
 _LOOK_SECONDS = 0.05
 
 
-async def end_nodes(nodes: Nodes, own: Iterable[str], seconds: float) -> None:
+class Patience(NamedTuple):
+    """Seconds of a node that ends without dora."""
+
+    until_sigterm: float
+    until_sigkill: float  # after SIGTERM
+
+
+async def end_nodes(
+    nodes: Nodes, own: Iterable[str], seconds: float, apart: Mapping[str, Patience] | None = None
+) -> None:
     """End the nodes `own` without dora, which would wait for a machine that is gone.
 
-    Every process gets SIGTERM, and SIGKILL if it is left after `seconds`.
+    Every process gets SIGTERM, and SIGKILL if it is left after `seconds`. apart: the time of nodes
+    that have another one.
     """
+    usual, apart = Patience(0.0, seconds), apart or {}
     unit, _ = nodes.places
     own = list(own)
     nodes.let_go()
@@ -149,10 +177,21 @@ async def end_nodes(nodes: Nodes, own: Iterable[str], seconds: float) -> None:
     nodes.gates.make(own)
     nodes.gates.dismiss()
     groups = cgroup.node_groups(unit)
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            await asyncio.gather(*(_end(groups[node]) for node in own if node in groups))
+    ends = (_end_within(groups[one], apart.get(one, usual)) for one in own if one in groups)
+    await asyncio.gather(*ends)
     nodes.kill()
+
+
+async def _end_within(group: Path, patience: Patience) -> None:
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(patience.until_sigterm):
+            while [*cgroup.pids(group)]:
+                await asyncio.sleep(_LOOK_SECONDS)
+    try:
+        async with asyncio.timeout(patience.until_sigkill):
+            await _end(group)
+    except TimeoutError:
+        cgroup.kill_group(group)
 
 
 async def _end(group: Path) -> None:

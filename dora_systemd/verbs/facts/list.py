@@ -227,8 +227,8 @@ def _signs(status: CellStatus, node: str, now_us: int) -> dict[str, Any]:
 
 def _stop_left(status: CellStatus, node: str, now_us: int) -> dict[str, Any]:
     """The fields of a row about the stop of a node that has a time of its own."""
-    due = status.stop_dues.get(node)
-    is_there = node in status.nodes and status.nodes[node].pid
+    due, one = status.stop_dues.get(node), status.nodes.get(node)
+    is_there = one and (one.pid or (one.machine and one.is_alive))
     return {"stop_left": max(due - now_us, 0)} if due and is_there else {}
 
 

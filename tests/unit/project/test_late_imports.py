@@ -102,13 +102,16 @@ LATE = {
         "runner.main": {
             "runner.cell.notices",
             *("runner.machines.head", "runner.machines.member", "runner.needs"),
-            "runner.cell.node_stops",
             *("runner.owes.watch", "runner.recorder.keep"),
         },
         "verbs.facts.reading": {
             *("decisions.machines.usage", "decisions.owes.probe"),
             *("verbs.facts.held", "verbs.facts.budget", "decisions.cell.owes"),
         },
+    },
+    "few stops have an order": {
+        "runner.cell.machine_role": {"runner.cell.node_stops"},
+        "runner.machines.head": {"runner.machines.order"},
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},

@@ -74,11 +74,9 @@ def test_many_ways_through_the_nodes_take_no_time() -> None:
     assert total(stops, GRACE) == 499 * 6 * SECOND + 15 * SECOND
 
 
-def _refusal(
-    *stops: NodeStop, grace: int = GRACE, limit: int = LIMIT, machines: bool = False
-) -> DoraSystemdError:
+def _refusal(*stops: NodeStop, grace: int = GRACE, limit: int = LIMIT) -> DoraSystemdError:
     with pytest.raises(DoraSystemdError) as caught:
-        check_stops(stops, limit, grace, NODES, machines)
+        check_stops(stops, limit, grace, NODES)
     assert caught.value.code == ExitCode.BAD_INPUT
     assert caught.value.hint
     return caught.value
@@ -92,7 +90,6 @@ def test_what_no_dataflow_can_have() -> None:
     assert "that is a circle" in circle.message
     for node in ("arm", "recorder", "upload"):
         assert node in circle.message
-    assert "machines" in _refusal(UPLOAD, machines=True).message
 
 
 def test_a_stop_fits_its_limit() -> None:
@@ -102,5 +99,5 @@ def test_a_stop_fits_its_limit() -> None:
         "and stop_limit is 3min 20s"
     )
     assert "infinity" in _refusal(UPLOAD, grace=INFINITY).message
-    check_stops((RECORDER, UPLOAD), 235 * SECOND, GRACE, NODES, machines=False)
-    check_stops((), 0, GRACE, NODES, machines=True)
+    check_stops((RECORDER, UPLOAD), 235 * SECOND, GRACE, NODES)
+    check_stops((), 0, GRACE, NODES)

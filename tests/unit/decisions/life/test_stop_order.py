@@ -171,3 +171,120 @@ def test_its_status_names_who_comes_when() -> None:
     )
     now, _ = after(now, *[exited(node) for node in ("camera", "arm", "screen", "recorder")])
     assert format_status(now) == "stopping, waiting for upload"
+
+
+SPREAD = ("recorder", "camera")
+"""The nodes of this class run on the member gpu."""
+
+
+def head(**changes: object) -> Cell:
+    nodes = {
+        node: one._replace(pid=0, machine="gpu") if node in SPREAD else one
+        for node, one in cell().nodes.items()
+    }
+    return cell(nodes=nodes, members=("gpu",), **changes)
+
+
+def member(**changes: object) -> Cell:
+    nodes = {node: one for node, one in cell().nodes.items() if node in SPREAD}
+    stops = {"recorder": STOPS["recorder"]}
+    return cell(nodes=nodes, stops=stops, stop_limit=LIMIT // 2, machine="gpu", **changes)
+
+
+LOST = life.MachineLost(5, "gpu", "no word for 7s")
+HEAD_STOPS = life.HeadStops(1, "SIGTERM", LIMIT)
+
+
+def test_the_order_holds_across_machines() -> None:
+    now, done = after(head(), STOP)
+    assert done == [StopNode("camera", GRACE), StopNode("arm", GRACE), StopNode("screen", GRACE)]
+    now, done = after(now, exited("arm"), exited("screen"), exited("camera"))
+    assert done == [StopNode("recorder", WITHIN)]
+    now, done = after(now, exited("recorder"))
+    assert done == [StopNode("upload", GRACE)]
+    assert step(now, exited("upload"))[0].state is State.LEAVING
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_lost_machine_leaves_the_others_their_order(waits: bool) -> None:
+    """Without the policy no other run follows; with it the same nodes stop."""
+    now, actions = step(head(waits_for_lost=waits), LOST)
+    assert (now.state, now.reload) == (State.STOPPING, waits)
+    assert Do.END_NODES not in actions
+    told = [one.node for one in actions if isinstance(one, StopNode)]
+    assert told == ["arm", "upload", "screen"], "the recorder is gone with its machine"
+    now, _ = after(now, exited("arm"), exited("screen"), exited("upload"))
+    assert now.state is State.LEAVING
+
+
+def test_a_machine_that_is_lost_during_the_stop_holds_nobody_up() -> None:
+    now, _ = after(head(), STOP, exited("arm"), exited("screen"))
+    now, actions = step(now, LOST)
+    assert StopNode("upload", GRACE) in actions
+    assert not [one for one in actions if isinstance(one, Deadline)], "the time runs on"
+    assert step(now, exited("upload"))[0].state is State.LEAVING
+
+
+def test_nodes_of_a_part_that_is_stopped_on_its_machine_stop_in_their_turn() -> None:
+    stopped = replace(LOST, reason="", by="SIGTERM", is_waiting=True)
+    now, done = after(head(), stopped)
+    assert StopNode("camera", GRACE) in done
+    assert now.exit is RunnerExit.STOPPED_ON_MACHINE
+    now, done = after(now, exited("arm"), exited("camera"))
+    assert StopNode("recorder", WITHIN) in done
+
+
+def test_a_member_stops_a_node_when_the_head_says_so() -> None:
+    now, actions = step(member(), HEAD_STOPS)
+    assert now.state is State.STOPPING
+    assert not any(one in actions for one in (Do.ASK_STOP, Do.END_NODES))
+    assert not [one for one in actions if isinstance(one, StopNode)]
+    turn = life.NodeTurn(2, "recorder", WITHIN)
+    now, done = after(now, life.NodeTurn(2, "camera", GRACE), exited("camera"), turn, turn)
+    assert done == [StopNode("camera", GRACE), StopNode("recorder", WITHIN)]
+    assert format_status(now) == "stopping, waiting for recorder"
+    assert after(now, life.NodeTurn(2, "camera", 1), life.NodeTurn(2, "unknown", 1))[1] == []
+    now, done = after(now, life.NodeOverdue(3, "recorder"), life.NodeOverdue(3, "recorder"))
+    assert done == [EndNode("recorder", after=HALF), EndNode("recorder")]
+
+
+def test_a_member_keeps_its_daemon_until_the_head_has_stopped_all() -> None:
+    now, _ = after(member(), HEAD_STOPS, exited("camera"), exited("recorder"))
+    assert now.state is State.STOPPING, "the daemon may have the last messages of the camera"
+    now, actions = step(now, life.HeadStops(9, "SIGTERM"))
+    assert now.state is State.LEAVING
+    assert Do.DISMISS_DAEMON in actions
+
+
+def test_a_head_that_does_not_wait_any_more_has_its_members_leave() -> None:
+    now, actions = step(step(member(), HEAD_STOPS)[0], life.HeadStops(9, "SIGTERM"))
+    assert actions == (Deadline(2 * SECOND),)
+    assert step(now, life.DeadlinePassed(10))[0].state is State.LEAVING
+
+
+def test_a_shutdown_of_the_machine_of_a_member_that_stops_is_no_second_request() -> None:
+    now = step(member(), HEAD_STOPS)[0]
+    now, actions = step(now, STOP)
+    assert (now.state, actions) == (State.STOPPING, ())
+    assert step(now, STOP)[0].state is State.LEAVING
+
+
+def test_a_member_that_is_stopped_here_waits_for_the_order() -> None:
+    now, actions = step(member(), STOP)
+    assert Do.ASK_STOP in actions, "which lets the head know"
+    assert Deadline(LIMIT // 2 + 2 * SECOND) in actions
+    now, actions = step(now, HEAD_STOPS)
+    assert now.awaits_head
+    assert actions == (Deadline(LIMIT + 4 * SECOND),)
+
+
+def test_a_member_without_its_head_gives_its_nodes_their_time() -> None:
+    now, actions = step(step(member(), HEAD_STOPS)[0], life.HeadLost(3, "no word for 7s"))
+    assert Do.END_NODES in actions
+    assert Deadline(LIMIT + 2 * SECOND) in actions
+    assert step(now, life.StopAnswered(4))[0].state is State.LEAVING
+
+
+def test_without_an_order_a_second_word_of_the_head_has_no_effect() -> None:
+    now = step(member(), life.HeadStops(1, "SIGTERM"))[0]
+    assert step(now, life.HeadStops(2, "SIGTERM")) == (now, ())

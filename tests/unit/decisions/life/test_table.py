@@ -75,8 +75,10 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     life.MachineLost: (
         life.MachineLost(1, "gpu", "no word for 7s"),
         life.MachineLost(1, "gpu", "", by="SIGTERM"),
+        life.MachineLost(1, "gpu", "", by="SIGTERM", is_waiting=True),
     ),
-    life.HeadStops: (life.HeadStops(1, "SIGTERM"),),
+    life.HeadStops: (life.HeadStops(1, "SIGTERM"), life.HeadStops(1, "SIGTERM", 60 * SECOND)),
+    life.NodeTurn: (life.NodeTurn(1, "a", SECOND), life.NodeTurn(1, "unknown", SECOND)),
     life.HeadLost: (life.HeadLost(1, "no word for 7s"),),
     life.DeadlinePassed: (life.DeadlinePassed(1),),
 }
@@ -103,7 +105,10 @@ ORDERED: dict[str, object] = {
 }
 
 
-@pytest.mark.parametrize("changes", [{}, ORDERED], ids=["plain", "ordered"])
+MEMBER = {**ORDERED, "machine": "gpu", "awaits_head": True}
+
+
+@pytest.mark.parametrize("changes", [{}, ORDERED, MEMBER], ids=["plain", "ordered", "member"])
 @pytest.mark.parametrize("state", State)
 def test_every_pair(state: State, changes: dict[str, object]) -> None:
     for event in EACH:

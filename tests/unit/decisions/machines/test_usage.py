@@ -94,5 +94,11 @@ def test_what_a_node_says_of_itself() -> None:
     assert merged(CellStatus(nodes=NODES), {"gpu": strange}).signs == {"mid": ("", 0, 0)}
 
 
+def test_the_time_left_of_nodes_elsewhere() -> None:
+    said = CellStatus(stop_dues={"mid": 7, "eye": 8})
+    table = merged(CellStatus(nodes=NODES, stop_dues={"eye": 5}), {"gpu": said})
+    assert table.stop_dues == {"eye": 5, "mid": 7}
+
+
 def test_a_head_does_not_lie_about_its_own_nodes_either() -> None:
     assert uses_of(CellStatus(nodes=NODES, usage={"eye": TOLD, "nose": TOLD})) == {}

@@ -145,8 +145,9 @@ def _of_nodes(key: str, text: str) -> tuple[SettingText, ...]:
 def test_each_machine_gets_the_settings_of_its_nodes() -> None:
     head, words, there = spread("stop", "within=7s")
     assert words == ["stop=within=7s", "yolo:stop=within=7s"]
-    assert head.by_node("stop") == {"camera": NodeStop("", 7 * SECOND)}
-    assert there.by_node("stop") == {"yolo": NodeStop("", 7 * SECOND)}
+    stop = NodeStop("", 7 * SECOND)
+    assert head.by_node("stop") == {"camera": stop, "yolo": stop}, "the head has the order"
+    assert there.by_node("stop") == {"yolo": stop}
 
 
 def test_the_head_decides_with_what_its_members_know_too() -> None:

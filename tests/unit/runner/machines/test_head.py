@@ -220,7 +220,7 @@ def test_a_stop_asks_dora_while_all_are_there(tmp_path: Path) -> None:
         bench.dora.answers["Stop"].append({})
         bench.actions[Do.ASK_STOP]()
         await settle()
-        assert {"type": "stopping", "by": "SIGTERM"} in other.heard()
+        assert {"type": "stopping", "by": "SIGTERM", "limit": 0} in other.heard()
         assert bench.heard(life.StopAnswered)
         assert not bench.ended
 

@@ -18,15 +18,16 @@ from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import NodeRights, rights_of
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Cell, Do, State
+from dora_systemd.decisions.life.states import Cell, Do, GiveTime, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.restarts import Life
-from dora_systemd.runner.machines.member import Member
-from dora_systemd.runner.machines.member_dialogue import MemberDialogue, find_pids
-from dora_systemd.runner.machines.shared import MemberEngine
+from dora_systemd.runner.machines.member import Member, with_left
+from dora_systemd.runner.machines.member_dialogue import MemberDialogue, find_pids, times_left
+from dora_systemd.runner.machines.shared import MemberEngine, Patience
 from dora_systemd.values import SECOND
 from tests.unit.fakes.boots import told_boot
 from tests.unit.fakes.dialogue import Heard
@@ -186,7 +187,7 @@ def test_what_the_head_says(tmp_path: Path) -> None:
         ]
         bench.be(stop_by="SIGTERM")
         bench.actions[Do.EXIT]()
-        assert other.heard() == [{"type": "ended", "reason": "", "by": "", "failed": 0}]
+        assert other.heard() == [{"type": "ended", "reason": "", "by": "", "failed": 0, "waits": 0}]
 
     run(tmp_path, work)
 
@@ -232,7 +233,7 @@ def test_who_stops_it_here_is_told_but_a_shutdown_is_nobody(
         bench.member.is_going_down = lambda _: is_down
         bench.be(stop_by="SIGTERM")
         bench.actions[Do.EXIT]()
-        assert other.heard() == [{"type": "ended", **ended, "failed": 0}]
+        assert other.heard() == [{"type": "ended", **ended, "failed": 0, "waits": 0}]
 
     run(tmp_path, work)
 
@@ -262,7 +263,8 @@ def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path
         bench.be(stop_by="SIGTERM")
         stop = asyncio.create_task(bench.dialogue._stop())
         await settle()
-        assert other.heard() == [{"type": "ended", "reason": "", "by": "SIGTERM", "failed": 0}]
+        told = {"reason": "", "by": "SIGTERM", "failed": 0, "waits": 0}
+        assert other.heard() == [{"type": "ended", **told}]
         assert not bench.has_ended, "the head has not answered yet"
         other.say(wire.StopPart(SECOND))
         await stop
@@ -290,7 +292,8 @@ def test_its_own_failure_is_told(tmp_path: Path) -> None:
         bench.be(failure="the dora daemon is gone (signal SIGKILL)")
         bench.actions[Do.EXIT]()
         reason = "the dora daemon is gone (signal SIGKILL)"
-        assert other.heard() == [{"type": "ended", "reason": reason, "by": "", "failed": 1}]
+        told = {"reason": reason, "by": "", "failed": 1, "waits": 0}
+        assert other.heard() == [{"type": "ended", **told}]
 
     run(tmp_path, work)
 
@@ -375,3 +378,73 @@ def test_only_the_head_decides_what_is_essential(tmp_path: Path) -> None:
     options = with_rights(OPTIONS, NodeRights("mid", essential=True, nice=5))
     member = Member(options, Life("uuid"), told_boot(options, tmp_path, PART))
     assert rights_of(member.options) == (NodeRights("mid", nice=5),)
+
+
+def test_its_nodes_stop_in_the_order_of_the_head(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        stops = bench.member.node_stops(bench.pump, bench.dora, bench.nodes, bench.dialogue)
+        other = await bench.head()
+        other.say(wire.Stopping("SIGTERM", 100 * SECOND), wire.StopNode("mid", SECOND, 9 * SECOND))
+        await settle()
+        assert bench.heard()[1:] == [
+            life.HeadStops(0, "SIGTERM", 100 * SECOND),
+            life.NodeTurn(0, "mid", SECOND),
+        ]
+        bench.be(state=State.STOPPING)
+        stops.perform(GiveTime("mid", SECOND))  # the node is stopping
+        stops._begin()
+        stops.extend("mid", 60 * SECOND)
+        (extends,) = [one for one in bench.heard() if isinstance(one, life.NodeExtends)]
+        assert extends.wanted <= 9 * SECOND, "others wait for the node"
+
+    run(tmp_path, work, State.RUNNING)
+
+
+def test_a_part_that_is_stopped_here_waits_for_the_order_of_the_head(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        bench.member.is_going_down = lambda _: False
+        bench.be(state=State.STOPPING, stop_by="SIGTERM")
+        stop = asyncio.create_task(bench.dialogue._stop())
+        while not (told := other.heard()):
+            await asyncio.sleep(0)
+        assert told[0]["waits"] == 1
+        other.say(wire.Stopping("head", 100 * SECOND))
+        await stop
+        assert not bench.has_ended
+        assert bench.heard()[-1] == life.HeadStops(0, "head", 100 * SECOND)
+
+    run(tmp_path, work, State.RUNNING)
+
+
+def test_who_has_its_own_time_gets_it_without_a_head_too(tmp_path: Path) -> None:
+    """SIGTERM is its stop, and SIGKILL comes when its time is over."""
+
+    async def work(bench: Bench) -> None:
+        bench.be(ready_us=1, stops={"mid": NodeStop("mid", 3 * SECOND)})
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        bench.actions[Do.ASK_STOP]()
+        while not bench.has_ended:
+            await asyncio.sleep(0.01)
+        # A second for the answer of the head, and its own time.
+        assert loop.time() - begun == pytest.approx(4.0, abs=0.2)
+
+    group = tmp_path / "node-mid"
+    group.mkdir()
+    with subprocess.Popen(["sh", "-c", "trap '' TERM; sleep 60"]) as stubborn:
+        (group / "cgroup.procs").write_text(f"{stubborn.pid}\n")
+        run(tmp_path, work, State.STOPPING)
+        stubborn.kill()
+
+
+def test_the_time_that_is_left() -> None:
+    stops = {"a": NodeStop("a", 5 * SECOND), "b": NodeStop("b", 5 * SECOND), "c": NodeStop("c")}
+    cell = Cell(SECOND, 0, {}, ready_us=1, stops=stops)
+    assert times_left(cell, {"b": 7 * SECOND}, 4 * SECOND) == {
+        "a": Patience(0.0, 5.0),
+        "b": Patience(3.0, 0.5),
+    }
+    assert times_left(replace(cell, ready_us=0), {}, 0) == {}
+    table = CellStatus(stop_dues={"b": 7 * SECOND, "c": 1})
+    assert with_left(table, 4 * SECOND).stop_dues == {"b": 3 * SECOND, "c": 0}

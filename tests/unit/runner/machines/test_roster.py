@@ -16,7 +16,8 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.resources.usage import LineCount
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.runner.machines.roster import Roster
+from dora_systemd.runner.machines.roster import Roster, with_dues
+from dora_systemd.runner.nodes.watchdog import monotonic_us
 from tests.unit.fakes.ends import FakeEnds
 from tests.unit.fakes.loop import live
 
@@ -424,5 +425,30 @@ def test_why_a_member_ends_a_node(word: wire.Hung, is_believed: bool) -> None:
         await settle()
         told = [life.NodeHung(0, word.node, word.reason, word.record)] if is_believed else []
         assert bench.heard()[1:] == told
+
+    run(work)
+
+
+def test_the_time_left_of_a_node_there_is_shown_by_the_clock_here() -> None:
+    """A member can send any number, and `list` must read the table of the head."""
+    there = CellStatus(stop_dues={"mid": 3, "flood": 2**63 - 1})
+    now = monotonic_us()
+    shown = with_dues(there)
+    assert [*shown.stop_dues] == ["mid"]
+    assert 0 <= shown.stop_dues["mid"] - now - 3 < 10_000_000
+    assert CellStatus.from_json(shown.to_json()) == shown
+
+
+def test_a_part_that_waits_for_its_turn_is_still_there() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, wire.Ended("", "root", waits=1))
+        await settle()
+        words = "it was stopped there by root"
+        lost = life.MachineLost(0, "gpu", words, "root", is_waiting=True)
+        assert bench.heard() == [life.MachineJoined(0, "gpu"), lost]
+        bench.roster.tell(wire.StopNode("mid", 1, 2), "gpu")
+        bench.roster.tell(wire.StopNode("eye", 1, 2), "cam")
+        assert [one["node"] for one in other.heard() if one["type"] == "stop-node"] == ["mid"]
 
     run(work)
