@@ -47,7 +47,7 @@ def whole_rows(
 ) -> list[DataflowRow]:
     """The rows that row_of() has made of `readings`, with all that is known."""
     found = [
-        _with_containers(one, row)._replace(
+        with_containers(one, row)._replace(
             restart_budget=restart_budget(manager, scope, one.cell, one.status)
         )
         for one, row in zip(readings, rows, strict=True)
@@ -55,7 +55,7 @@ def whole_rows(
     return mark_inhibited(scope, mark_enabled(manager, scope, found)) if found else []
 
 
-def _with_containers(reading: Reading, row: DataflowRow) -> DataflowRow:
+def with_containers(reading: Reading, row: DataflowRow) -> DataflowRow:
     """The row with the containers that its nodes have started."""
     if not (found := read_containers(reading.groups)):
         return row

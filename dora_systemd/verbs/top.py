@@ -15,7 +15,7 @@ from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.list import row_of
 from dora_systemd.verbs.facts.reading import Reading, read_dataflow, slice_group
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.list import whole_rows
+from dora_systemd.verbs.list import whole_rows, with_containers
 from dora_systemd.verbs.node import require_running
 
 _Seen = tuple[Reading, Mapping[str, Strain]]
@@ -84,6 +84,8 @@ def read_snapshot(manager: Manager, scope: Scope, is_whole: bool = False) -> lis
     rows = list(map(row_of, readings))
     if is_whole:
         rows = whole_rows(manager, scope, readings, rows)
+    else:
+        rows = list(map(with_containers, readings, rows))
     return list(map(_observe, readings, rows))
 
 

@@ -110,6 +110,21 @@ def test_podman_without_more(hers: Callable[..., None]) -> None:
 
 @PODMAN
 @pytest.mark.lab
+@pytest.mark.warns("conmon", "podman", "libpod", "crun", "policy")
+def test_a_node_that_is_stopped_leaves_its_container(hers: Callable[..., None]) -> None:
+    """The journal says when it began, and who stops the node is told that it still runs."""
+    hers("--name=outer")
+    one = container_of_alice("outer")
+    text = "Node policy has started a container of podman outside of its cgroup"
+    wait_for("the event", lambda: text in as_alice("doractl", "logs", "hers", "--events"))
+    (line,) = as_alice("doractl", "node", "stop", "hers", "policy").splitlines()
+    assert line.startswith(f"Node stopping: policy; podman container outer ({one['id'][:12]}, ")
+    assert line.endswith("of policy still runs, run: podman stop outer")
+    assert as_alice("doractl", "logs", "hers", "--events").count(text) == 1
+
+
+@PODMAN
+@pytest.mark.lab
 @pytest.mark.warns("conmon", "podman", "libpod", "crun")
 def test_podman_with_split_cgroups(hers: Callable[..., None]) -> None:
     """The recipe of docs/containers.md: all that holds for the node holds for its container."""

@@ -7,6 +7,7 @@ from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, scope_options
 from dora_systemd.decisions.cell.status import RESTART, STOP
 from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.verbs.facts.containers import outside_of_node, with_left
 from dora_systemd.verbs.facts.locks import IfInhibited
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import NodeOrder, order_node
@@ -48,7 +49,9 @@ def stop(selector: str, node: str, force: bool, wait: bool) -> int:
 
 def _order(selector: str, what: str, node: str, how: IfInhibited) -> int:
     scope = current_scope()
-    cell = Selector(selector).find_present(Bus(scope), scope)
+    bus = Bus(scope)
+    cell = Selector(selector).find_present(bus, scope)
     given = NodeOrder(what, node, _DOORS[what])
+    outside = outside_of_node(bus, cell.unit, node)
     done = order_node(scope, cell, given, how=how, tell=TellWaiting())
-    return print_outcomes([Outcome(cell, done, node=node)])
+    return print_outcomes(with_left([Outcome(cell, done, node=node)], outside))

@@ -79,6 +79,11 @@ EVENTS = {
     "node-stop-late": EventKind(
         "dcee148c33f9474391d52960af3b00c4", WARNING, "Node {node} has not stopped in its time"
     ),
+    "container-outside": EventKind(
+        "33bd31ef93fe4f4e880dbb72e705e366",
+        NOTICE,
+        "Node {node} has started a container of {program} outside of its cgroup",
+    ),
     "notify-refused": EventKind(
         "1bd51be61e0640ab97f9b364c5014cf0",
         WARNING,

@@ -37,6 +37,7 @@ class Client(NamedTuple):
     began: float = 0.0  # seconds since the boot
     uid: int = -1
     parent: int = 0
+    is_split: bool = False  # whether podman puts the container below the cgroup of its caller
 
 
 class Container(NamedTuple):
@@ -61,6 +62,11 @@ class Container(NamedTuple):
         """The command that stops it."""
         return f"{self.program} stop {self.name or self.id[:_SHORT]}" if self.id else ""
 
+    @property
+    def labels(self) -> dict[str, str]:
+        """The labels of its metric."""
+        return {"program": self.program, "container": self.name or self.id[:_SHORT]}
+
     def values(self) -> dict[str, Any]:
         """The container for JSON."""
         return {
@@ -82,7 +88,9 @@ def client_of(pid: int, arguments: Sequence[str]) -> Client | None:
         return Client(pid, program, id, _name(name)) if _ID.fullmatch(id) else None
     if program in CLIENTS and {*arguments[1:_MOST_OPTIONS]} & {*_VERBS}:
         joined = (one.removeprefix("--name=") for one in arguments if one.startswith("--name="))
-        return Client(pid, program, name=_name(options.get("--name", next(joined, ""))))
+        is_split = "--cgroups=split" in arguments or options.get("--cgroups") == "split"
+        name = _name(options.get("--name", next(joined, "")))
+        return Client(pid, program, name=name, is_split=is_split)
     return None
 
 

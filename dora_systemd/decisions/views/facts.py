@@ -176,6 +176,10 @@ def _containers(some: "Sequence[Container]") -> list[dict[str, Any]]:
     return [one.values() for one in some]
 
 
+def _outside(row: NodeRow) -> list[Sample]:
+    return [(one.labels, one.memory or 0) for one in row.containers if not one.is_inside]
+
+
 def _ages(row: NodeRow) -> list[Sample]:
     return [sample for one in row.outputs for sample in _seconds(one.age, output=one.output)]
 
@@ -226,7 +230,8 @@ NODE_FACTS = (
         metric="silent", help="1 while an output that it owes is missing.", samples=_silent),
     Fact("outputs", value=_outputs, metric="last_output_age_seconds",
         help="Time since the last message of an owed output.", samples=_ages),
-    Fact("containers", value=_containers),
+    Fact("containers", value=_containers, metric="outside_memory_bytes",
+        help="Memory of a container that it has started outside of its cgroup.", samples=_outside),
 )  # fmt: skip
 _TOLD = [(one.field or one.key, one.told) for one in NODE_FACTS if one.told]
 

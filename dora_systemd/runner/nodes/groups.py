@@ -20,6 +20,7 @@ from dora_systemd.decisions.resources.usage import (
     limit_of,
     throttled_percent,
 )
+from dora_systemd.runner.nodes.clients import ClientWatch
 from dora_systemd.values import SECOND
 
 _ONE_SHORTAGE = 5.0
@@ -36,6 +37,7 @@ class Resources:
         self._seen: dict[Path, OomCounts] = {unit: read_oom(unit)}
         self._alarms: Alarms = {}
         self._most: dict[str, Most] = {}
+        self._clients = ClientWatch()
 
     def explain(self, group: Path) -> Oom | None:
         """Find whether a process in a group has just been killed because of memory, and how."""
@@ -67,14 +69,17 @@ class Resources:
         return Oom(owner, peak, limit, *largest(held))
 
     def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> list[Record]:
-        """Return events about limits that are close. samples: those before `now`."""
+        """Return events about limits that are close, and about containers without limits.
+
+        samples: those before `now`.
+        """
         nodes = cgroup.node_groups(self._unit)
         nodes.pop(PROBE, None)  # it is no node of the dataflow
         groups = {WHOLE_CELL: self._unit, **nodes}
         loads = {key: _load(path, key, samples, now) for key, path in groups.items()}
         self._most |= {key: self._most.get(key, Most()).after(one) for key, one in loads.items()}
         self._alarms, reports = look(self._alarms, loads, now.at_us)
-        return [Record(*one) for one in reports]
+        return [*(Record(*one) for one in reports), *self._clients.look(nodes)]
 
     def most(self, key: str) -> dict[str, str]:
         """Return the details of an end: the most that a node, or WHOLE_CELL, has used so far."""

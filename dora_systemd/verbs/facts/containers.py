@@ -111,16 +111,22 @@ def outside_of(manager: Manager, unit: str, proc: Path = PROC) -> list[tuple[str
     ]
 
 
+def outside_of_node(manager: Manager, unit: str, node: str, proc: Path = PROC) -> "Outside":
+    """The containers of one node that do not end with the node."""
+    found = find_outside(manager, [unit], proc)
+    return {unit: [one for one in some if one[0] == node] for unit, some in found.items()}
+
+
 Outside = Mapping[str, Sequence[tuple[str, Container]]]
 """Containers with their nodes, by unit."""
 
 
-def find_outside(manager: Manager, units: Iterable[str]) -> Outside:
+def find_outside(manager: Manager, units: Iterable[str], proc: Path = PROC) -> Outside:
     """The containers that do not end with these units, without units that have none."""
     found = {}
     for unit in units:
         with suppress(DoraSystemdError):
-            found[unit] = outside_of(manager, unit)
+            found[unit] = outside_of(manager, unit, proc)
     return {unit: some for unit, some in found.items() if some}
 
 

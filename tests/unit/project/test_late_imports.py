@@ -109,9 +109,10 @@ LATE = {
             *("verbs.facts.held", "verbs.facts.budget", "decisions.cell.owes"),
         },
     },
-    "few stops have an order": {
+    "few stops have an order, and few nodes start containers": {
         "runner.cell.machine_role": {"runner.cell.node_stops"},
         "runner.machines.head": {"runner.machines.order"},
+        "runner.nodes.clients": {"adapters.host.clients"},
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},

@@ -31,6 +31,8 @@ CONMON = ("/usr/bin/conmon", "--api-version", "1", "-c", ID, "-u", ID, "-n", "he
         (("conmon", "--version"), None),
         (("podman", "run", "--name", "hello", "x"), Client(7, "podman", name="hello")),
         (("podman", "--log-level", "info", "run", "--name=b", "x"), Client(7, "podman", name="b")),
+        (("podman", "run", "--cgroups=split", "x"), Client(7, "podman", is_split=True)),
+        (("podman", "run", "--cgroups", "split", "x"), Client(7, "podman", is_split=True)),
         (("/usr/bin/docker", "run", "--gpus=all", "x"), Client(7, "docker")),
         (("docker", "compose", "up"), Client(7, "docker")),
         (("docker", "ps"), None),

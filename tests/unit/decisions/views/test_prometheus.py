@@ -13,6 +13,7 @@ from prometheus_client.openmetrics.parser import (
 )
 from prometheus_client.parser import text_string_to_metric_families
 
+from dora_systemd.decisions.resources.containers import Container
 from dora_systemd.decisions.resources.usage import LineCount, Strain, Usage
 from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.prometheus import STATES, format_metrics
@@ -125,6 +126,17 @@ def test_the_time_left_of_a_stop() -> None:
     row = ROBOT.row._replace(nodes=(camera._replace(stop_left=SECOND), plot))
     found = families(replace(ROBOT, row=row))
     assert [one.value for one in found["dora_node_stop_left_seconds"].samples] == [1]
+
+
+def test_containers_outside() -> None:
+    outer = Container("podman", "a" * 64, "outer", "/x", 7)
+    inner = outer._replace(is_inside=True)
+    camera, plot = ROBOT.row.nodes
+    nodes = (camera._replace(containers=(outer, inner, Container("docker"))), plot)
+    found = families(replace(ROBOT, row=ROBOT.row._replace(nodes=nodes)))
+    samples = found["dora_node_outside_memory_bytes"].samples
+    labels = [(one.labels["program"], one.labels["container"], one.value) for one in samples]
+    assert labels == [("podman", "outer", 7), ("docker", "", 0)]
 
 
 def test_what_is_special_about_a_node() -> None:

@@ -4,7 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.verbs.facts.containers import left_of, outside_of, read_containers
+from dora_systemd.verbs.facts.containers import (
+    left_of,
+    outside_of,
+    outside_of_node,
+    read_containers,
+)
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.manager import FakeManager, options
 
@@ -101,3 +106,17 @@ def test_what_a_stop_leaves(machine: Machine) -> None:
 def test_a_unit_that_does_not_run() -> None:
     manager = FakeManager()
     assert outside_of(manager, manager.add(options(), active="failed")) == []
+
+
+def test_of_one_node_only(machine: Machine) -> None:
+    other = f"{UNIT}/node-eye"
+    machine.add(20, NODE, "docker", "run", "x")
+    machine.add(21, other, "docker", "run", "x", began=200)
+    machine.add(22, f"/system.slice/docker-{DOCKER}.scope", "sleep", began=150)
+    machine.add(23, f"/system.slice/docker-{'e' * 64}.scope", "sleep", began=250)
+    manager = FakeManager()
+    unit = manager.add(options(), ControlGroup=UNIT)
+    found = outside_of_node(manager, unit, "eye", machine.proc)
+    assert {one: [(node, c.id) for node, c in some] for one, some in found.items()} == {
+        unit: [("eye", "e" * 64)]
+    }
