@@ -10,6 +10,7 @@ from lab import cgroup
 from lab.browser import ensure_browser
 from lab.cache import find_cache, remove_all
 from lab.container import run_in_container
+from lab.coredumps import ensure_with_coredump
 from lab.definition import PLATFORMS
 from lab.errors import LabError
 from lab.image import ensure_tree
@@ -17,7 +18,6 @@ from lab.machine import run_in_emulator, run_in_vm
 from lab.machines import run_in_machines
 from lab.openarm import ensure_openarm
 from lab.options import Options, parse_options
-from lab.platforms import ensure_platform
 from lab.process import need_root
 from lab.rivals import ensure_rivals
 from lab.runs import Guard, clean_dead_runs, close_run, open_run, opened_door
@@ -88,7 +88,7 @@ ENSURE: dict[str, Callable[[Path], Path]] = {
     "browser": ensure_browser,
     "openarm": ensure_openarm,
     "machines": ensure_tree,
-    **{suite: partial(ensure_platform, suite=suite) for suite in PLATFORMS},
+    **{suite: partial(ensure_with_coredump, suite=suite) for suite in PLATFORMS},
 }
 RUN = {
     "container": run_in_container,

@@ -13,6 +13,8 @@ from tests.system.gateways import Front
 from tests.system.releases import ETC, Releases
 
 REBOOT = "reboot"
+SECONDS = int(os.environ.get("SECONDS", "0"))
+"""What the recorder needs to complete its file; 0 for twice the grace duration."""
 HEADER = ("KIND", "COUNT", "LOST", "OVERTAKEN")
 
 
@@ -48,7 +50,7 @@ class Story:
 
     def begin(self) -> None:
         """Write the dataflow, and start it."""
-        recorders.flow(self.project)
+        recorders.flow(self.project, seconds=SECONDS)
         settings = self.project.root / "flow.systemd.yml"
         # Its failure ends the dataflow.
         settings.write_text(settings.read_text() + "  camera: {essential: yes}\n")
@@ -149,7 +151,7 @@ def _reload_node(story: Story) -> None:
 def _restart_node(story: Story) -> None:
     story.cell.doractl("node", "restart", story.cell.name, "recorder")
     saved, before = recorders.saved(story.project), story.table.episodes
-    wait_for("it has saved", lambda: len(list(saved.glob("*.json"))) > before, 60)
+    wait_for("it has saved", lambda: len(list(saved.glob("*.json"))) > before, 60 + SECONDS)
 
 
 def _deploy(story: Story) -> None:
@@ -184,7 +186,7 @@ def _dora_stop(story: Story) -> None:
 def _fail(story: Story) -> None:
     (pid,) = [one.pid for node, one in story.cell.status.nodes.items() if node == "camera"]
     run("kill", "-KILL", str(pid))
-    wait_for("it ends", lambda: story.cell.is_gone, 60)
+    wait_for("it ends", lambda: story.cell.is_gone, 60 + SECONDS)
 
 
 KINDS: Mapping[str, Callable[[Story], None]] = {
