@@ -23,6 +23,7 @@ from tests.platforms.test_packages import doractl, show, start
 from tests.system.cells import Project, run, sync_journal, wait_for, wait_no_process
 
 CORE_PATTERN = Path("/proc/sys/kernel/core_pattern")
+DUMPED = "fc2e22bc6ee647b6b90729ab34a250b1"
 UNPACKED = Path("/opt/coredump")
 PATTERN = re.compile(r"kernel\.core_pattern=\|(.*)")
 CRASHER = """
@@ -92,7 +93,7 @@ def pass_on(pid: int, core: Path) -> None:
     owner = Path(f"/proc/{pid}").stat()
     values = {
         "%P": pid, "%u": owner.st_uid, "%g": owner.st_gid, "%s": int(SIGSEGV),
-        "%t": int(time.time()), "%c": 2**63 - 1, "%h": "lab", "%d": 1, "%F": told, "%I": 1,
+        "%t": int(time.time()), "%c": 2**63 - 1, "%h": "lab", "%d": 1, "%F": told, "%I": pid,
     }  # fmt: skip
     words = [str(values.get(word, word)) for word in command.split()]
     with core.open("rb") as data:
@@ -123,6 +124,9 @@ def test_the_function_in_which_it_crashed(root: Path, how: str, function: str) -
     (pid,) = map(int, wait_for("its copy has crashed", ready, 60))
     (core,) = cores.glob("core*")
     pass_on(pid, core)
+    # systemd 262 needs the process, which the kernel keeps meanwhile.
+    record = ("journalctl", "-q", "-o", "cat", f"MESSAGE_ID={DUMPED}", f"COREDUMP_PID={pid}")
+    wait_for("it is recorded", lambda: run(*record, check=False).stdout)
     (cores / "taken").touch()
     wait_for("it has failed", lambda: show("root", "ActiveState") == "failed", 60)
     wait_for("its stack", lambda: function in "".join(functions()[:2]))
