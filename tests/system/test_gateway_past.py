@@ -4,11 +4,15 @@ import json
 import os
 import shutil
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from dora_systemd.decisions.gateway.timeline import MOST_MARKS
+from dora_systemd.gateway.live.past import read_timeline
+from dora_systemd.scope import Scope
 from tests.system.cells import TICK, Cell, Project, journalctl, sync_journal, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
@@ -27,6 +31,22 @@ FLOW = (
     f"  - {{id: shaky, path: lines.py, inputs: {{tick: {TICK}}}, restart_policy: on-failure,"
     " restart_delay: 0.1, max_restarts: 3}\n"
 )
+FORGER = """
+import socket
+from pathlib import Path
+from dora import Node
+sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+is_done = False
+for _ in Node():
+    if not is_done and Path("uuid").exists():
+        uuid = Path("uuid").read_text()
+        text = "<img src=x onerror=alert(1)>\\x1b[31mred"
+        entry = f"MESSAGE={text}\\nDORA_EVENT=node-crashed\\nDORA_DATAFLOW={uuid}\\n".encode()
+        for _ in range(8000):
+            sock.sendto(entry, "/run/systemd/journal/socket")
+        print("forged", flush=True)
+        is_done = True
+"""
 THINGS = "[...document.querySelectorAll('.past .thing')].map((e) => e.getAttribute('aria-label'))"
 FOCUSED = "document.activeElement.getAttribute('aria-label')"
 PHONE = (320, 740)
@@ -92,6 +112,43 @@ def look(browser: Browser, name: str) -> None:
 
 
 @pytest.mark.warns(*KILLED)
+def test_what_a_node_forges_is_bounded_text(
+    browser: Browser, cell: Cell, project: Project, front: Front
+) -> None:
+    project.write("lines.py", FORGER)
+    cell.start(project.write("dataflow.yml", FLOW))
+    uuid = cell.status.uuid
+    project.write("uuid", uuid)
+    wait_for("it has forged", lambda: "forged" in journalctl("-o", "cat", "-u", cell.unit))
+    sync_journal()
+    began = time.monotonic()
+    found = read_timeline(Scope(False, 0), uuid)
+    print(f"read in {time.monotonic() - began:.2f} s, {len(json.dumps(found))} bytes")
+    assert (len(found["marks"]), found["is_cut"]) == (MOST_MARKS, True)
+    browser.open(f"http://127.0.0.1:{front.port}/?later#{uuid}")
+    browser.wait_text(".past .note", "There was more than is shown here")
+    assert marks(browser, "<img src=x onerror=alert(1)>red")
+    assert browser.js("document.querySelectorAll('.past img').length") == 0
+    assert browser.failures() == []
+
+
+TIMES = """
+import('/page/words.js').then(({ since, zoneWords, local }) =>
+  [since(1795767615e6), zoneWords(), local(1795767615e6)])
+"""
+
+
+def test_times_are_local_with_utc_beside_them(browser: Browser) -> None:
+    browser.call("Emulation.setTimezoneOverride", timezoneId="Asia/Kolkata")
+    text, zone, field = browser.js(TIMES)
+    assert "13:50:15" in text
+    assert "(08:20:15 UTC), " in text
+    assert (zone, field) == ("times in UTC+05:30", "2026-11-27T13:50:15")
+    browser.call("Emulation.setTimezoneOverride", timezoneId="UTC")
+    text, zone, field = browser.js(TIMES)
+    assert ("(" in text, zone, field) == (False, "times in UTC", "2026-11-27T08:20:15")
+
+
 @pytest.mark.usefixtures("shaky")
 def test_the_timeline_without_a_pointer(browser: Browser) -> None:
     browser.wait_js(f"{THINGS}.some((one) => one.includes('crashed'))")
