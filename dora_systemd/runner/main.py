@@ -263,7 +263,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             pump.on_node = role.node_stops(pump, dora, runs.nodes, dialogue).perform
         variables = daemon_variables(own, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
-        if options.has("on_failure") and (file := request_file(os.environ)):
+        if options.is_noticed and (file := request_file(os.environ)):
             # Imported late: few dataflows have it.
             from dora_systemd.runner.cell.notices import notice_watch
 

@@ -224,6 +224,35 @@ for event in node:
     assert path.stat().st_size < 16 * 1024 * 1024
 
 
+@pytest.mark.warns(*CRASHES, "talker", "exited with", "failed: ", "is not written")
+def test_a_failure_that_nobody_has_seen(cell: Cell, project: Project, bundles: Path) -> None:
+    """One bundle of many failures of one cause; the setting bounds them."""
+    crash = "import sys\nfrom dora import Node\nfor e in Node():\n    sys.exit(3)\n"
+    project.write("node.py", crash)
+    flow = project.write(
+        "dataflow.yml",
+        "nodes: [{id: talker, path: node.py, inputs: {t: dora/timer/millis/100}}]\n",
+    )
+    project.write("dataflow.systemd.yml", "black_box: {keep: 2, size: 4M}\nrestart_policy: no\n")
+    cell.start(flow, check=False)
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
+    wait_for("a bundle is written", lambda: [*bundles.glob("*.tar")])
+    (path,) = bundles.glob("*.tar")
+    assert path.name.endswith("-failed.tar")
+    assert path.stat().st_size <= 2 << 20
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    found = texts(path)
+    about = json.loads(found["manifest.json"])
+    assert (about["event"], about["node"], about["by"]) == ("failed", "talker", "doranotice")
+    assert "node talker: exit code 3" in found["README.txt"].decode()
+    assert found["errors.txt"] == b""
+    wait_for("its event", lambda: journalctl("DORA_EVENT=bundle-written", f"DORA_FILE={path}"))
+    cell.doractl("restart", cell.name, check=False)
+    refused = ("DORA_EVENT=bundle-refused", f"DORA_DATAFLOW_NAME={cell.name}")
+    wait_for("no second one", lambda: journalctl(*refused), seconds=60)
+    assert [*bundles.glob("*.tar")] == [path]
+
+
 def test_a_full_disk(cell: Cell, project: Project) -> None:
     """It loses the bundle, with one line, and nothing is left of it."""
     cell.start(project.three_nodes())

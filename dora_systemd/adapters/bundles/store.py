@@ -88,17 +88,21 @@ class BundleStore:
 
     def remove(self, names: list[str]) -> None:
         """Remove bundles, or none of them. Raises DoraSystemdError (NOT_FOUND)."""
-        known = {one.id: one.path for one in self.known()}
+        known = {one.id for one in self.known()}
         for name in names:
             if name not in known:
                 hint = f"doractl bundles {self.name} lists all"
                 message = f"{self.name} has no bundle {shown(name)}"
                 raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
-        for name in dict.fromkeys(names):
-            with suppress(FileNotFoundError):
-                known[name].unlink()
+        self.drop(names)
         with suppress(OSError):  # there are more
             self.path.rmdir()
+
+    def drop(self, names: list[str]) -> None:
+        """Remove these bundles, which are known; the directory stays."""
+        for name in names:
+            with suppress(FileNotFoundError):
+                (self.path / name).unlink()
 
     def remove_partial(self) -> None:
         """Remove what a writer that was killed has left; call it with the lock."""

@@ -30,6 +30,7 @@ _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 
 MODULES = {
+    "black_box": "on_failure",
     "core_dumps": "rights",
     "cpu_limit": "limits",
     "cpu_weight": "limits",
@@ -108,6 +109,12 @@ class RunnerOptions(NamedTuple):
     def hot_reload(self) -> bool:
         """Whether files are watched."""
         return self.has("hot_reload") and bool(self.of_dataflow("hot_reload"))
+
+    @property
+    def is_noticed(self) -> bool:
+        """Whether something follows a failure: the command of on_failure, or a bundle."""
+        has_box = self.has("black_box") and self.of_dataflow("black_box") is not None
+        return has_box or self.has("on_failure")
 
     def has(self, key: str) -> bool:
         """Whether the dataflow or a node has a value of the setting."""

@@ -163,6 +163,11 @@ EVENTS = {
         NOTICE,
         "Bundle of dataflow {dataflow} is written: {file}",
     ),
+    "bundle-refused": EventKind(
+        "7ff052b3d4004d2e9bc47b79ca330729",
+        WARNING,
+        "Bundle of dataflow {dataflow} is not written",
+    ),
     "build-failed": EventKind(
         "c598b7b44f614a64a048fc856c696082",
         WARNING,
@@ -180,7 +185,9 @@ ROLLED_BACK = "release-rolled-back"
 BUILD_FAILED = "build-failed"
 FORGOTTEN = "dataflow-forgotten"
 GIVEN_UP, NOTICE_SENT, NOTICE_FAILED = "node-given-up", "notice-sent", "notice-failed"
-BUNDLE_WRITTEN = "bundle-written"
+BUNDLE_WRITTEN, BUNDLE_REFUSED = "bundle-written", "bundle-refused"
+NOTICE_ENDS = (NOTICE_SENT, NOTICE_FAILED, BUNDLE_WRITTEN, BUNDLE_REFUSED)
+"""What follows a failure. With DORA_UNTIL it names the newest failure that it is about."""
 REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK, BUILD_FAILED)
 """What doractl writes about a dataflow, outside of its unit."""
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from dora_systemd.decisions.logs.journal_events import (
     EVENTS,
     GIVEN_UP,
-    NOTICE_FAILED,
-    NOTICE_SENT,
+    NOTICE_ENDS,
     REQUESTS,
     ROLLED_BACK,
 )
@@ -204,15 +203,15 @@ def kernel_matches() -> list[str]:
 def notice_matches(scope: Scope, name: str) -> list[str]:
     """Matches for all that a notice reports, and for the notices that were sent."""
     events = [f"DORA_EVENT={one}" for one in ("dataflow-failed", "machine-lost", GIVEN_UP)]
-    asked = _asked_matches(scope, ROLLED_BACK, NOTICE_SENT, NOTICE_FAILED)
+    asked = _asked_matches(scope, ROLLED_BACK, *NOTICE_ENDS)
     failures = [*_systemd_matches(scope, name), f"MESSAGE_ID={UNIT_FAILED}"]
     own = [*scope_matches(scope, name), *events]
     return [*own, "+", *failures, "+", *asked, f"DORA_DATAFLOW_NAME={name}"]
 
 
 def sent_matches(scope: Scope, name: str) -> list[str]:
-    """Matches for the notices that were sent, which nodes cannot write."""
-    return [*_asked_matches(scope, NOTICE_SENT, NOTICE_FAILED), f"DORA_DATAFLOW_NAME={name}"]
+    """Matches for the notices and bundles that were written, which nodes cannot write."""
+    return [*_asked_matches(scope, *NOTICE_ENDS), f"DORA_DATAFLOW_NAME={name}"]
 
 
 def request_matches(scope: Scope, *events: str) -> list[str]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.logs.journal_events import NOTICE_FAILED, NOTICE_SENT, ROLLED_BACK
+from dora_systemd.decisions.logs.journal_events import NOTICE_ENDS, ROLLED_BACK
 from dora_systemd.decisions.logs.query import UNIT_FAILED
 from dora_systemd.names import is_node_id, is_readable
 from dora_systemd.values import SECOND, format_duration, format_moment
@@ -30,6 +30,7 @@ LOOK_BACK = 120 * SECOND
 """Failures before that are not reported, unless the notice before left them to the next one: they
 may be older than the setting."""
 MOST_RECORDS = 20_000
+MOST_ENDS = 100
 _MOST_TEXT = 500
 
 
@@ -60,7 +61,9 @@ def read_last(records: Iterable[Mapping[str, Any]], boot: str, now_us: int) -> S
 
     It is read by itself: nodes can write more records than read_story() reads.
     """
-    for record in islice(records, 1):
+    written = islice(records, MOST_ENDS)
+    # A bundle that was requested is about no failure.
+    for record in islice((one for one in written if "DORA_UNTIL" in one), 1):
         last = _sent(record, _number(record, "__MONOTONIC_TIMESTAMP"))
         if record.get("_BOOT_ID") == boot and now_us - last.mono_us <= 2 * LAST_PAUSE:
             return last
@@ -82,7 +85,9 @@ def read_story(
         if record.get("_BOOT_ID") != boot or mono_us <= bound:
             break
         event = str(record.get("DORA_EVENT", ""))
-        if event in (NOTICE_SENT, NOTICE_FAILED):
+        if event in NOTICE_ENDS:
+            if "DORA_UNTIL" not in record:
+                continue  # a bundle that was requested
             last = last or _sent(record, mono_us)
             bound = max(bound, last.until_us)
         elif event == "dataflow-failed":

@@ -219,7 +219,7 @@ def notice_properties(options: RunnerOptions) -> dict[str, Property]:
     The request is a file in a directory of the runner. Its parent is root's: systemd follows links
     when it watches a path, so the runner must not be able to replace any part of that path.
     """
-    if not options.has("on_failure"):
+    if not options.is_noticed:
         return {}
     return typed(
         OnFailure=(notice_unit(options.name),),

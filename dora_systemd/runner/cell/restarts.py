@@ -63,7 +63,7 @@ def report_last_life(options: RunnerOptions, environment: Mapping[str, str]) -> 
     systemd 254 starts the units of OnFailure= at each failure, and sets $FDSTORE; earlier versions
     start them only if no restart follows. The earlier life has left descriptors, see fd_store.
     """
-    file = request_file(environment) if options.has("on_failure") else None
+    file = request_file(environment) if options.is_noticed else None
     if file and "FDSTORE" not in environment and environment.get("LISTEN_FDNAMES"):
         with contextlib.suppress(OSError):
             file.touch(0o600)

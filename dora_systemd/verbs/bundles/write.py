@@ -4,7 +4,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bundles.archive import Archive, Section, Sink
-from dora_systemd.adapters.bundles.store import LEAST, REQUESTED, BundleStore, locked, room
+from dora_systemd.adapters.bundles.reader import opened
+from dora_systemd.adapters.bundles.store import LEAST, REQUESTED, BundleStore, Stored, locked, room
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request, requester
 from dora_systemd.adapters.journal.reader import JournalReader
@@ -25,19 +26,25 @@ from dora_systemd.decisions.bundles.manifest import (
     format_manifest,
 )
 from dora_systemd.decisions.bundles.readme import format_readme
-from dora_systemd.decisions.logs.journal_events import BUNDLE_WRITTEN
+from dora_systemd.decisions.cell.black_box import BlackBox, Past, is_too_soon, to_remove
+from dora_systemd.decisions.logs.journal_events import BUNDLE_REFUSED, BUNDLE_WRITTEN
 from dora_systemd.decisions.why.report import format_report
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import shown
 from dora_systemd.verbs.bundles.collect import Evidence, sections_of
 from dora_systemd.verbs.doctor import examine
-from dora_systemd.verbs.facts.cells import read_cell
+from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.why import explain, subject_row
 
 MOST_BYTES = 256 * 1024 * 1024
 """Maximum bytes of a bundle that is requested."""
+BY = "doranotice"
 _STAMP = "%Y%m%dT%H%M%SZ"
+
+
+def _now_us() -> int:
+    return time.time_ns() // 1000
 
 
 class Written(NamedTuple):
@@ -75,12 +82,8 @@ def write_bundle(
 
     reach: opens the connection to systemd. command: that requests it, such as "doractl bundle".
     """
-    manager, journal = reach(scope), JournalReader()
-    report = explain(manager, scope, selector, journal)
-    subject = report.subject
-    cell = read_cell(manager, subject.unit) if subject.is_loaded else None
-    row = subject_row(manager, scope, subject)
-    what = Evidence(manager, scope, report, row, cell, want_journal, partial(examine, reach, scope))
+    what = _evidence(reach, scope, selector, want_journal)
+    subject = what.report.subject
     manifest = _manifest(what, requester(command))
     if file is not None:
         with _explained(file):
@@ -94,6 +97,81 @@ def write_bundle(
     details = {"scope": scope.word, "file": str(written.path)}
     note_request(BUNDLE_WRITTEN, subject.name, subject.uuid, command, **details)
     return written
+
+
+def _evidence(
+    reach: Callable[[Scope], Manager], scope: Scope, selector: str, want_journal: bool
+) -> Evidence:
+    """Find the dataflow, and what is known of it. Raises DoraSystemdError."""
+    manager = reach(scope)
+    report = explain(manager, scope, selector, JournalReader())
+    subject = report.subject
+    cell = read_cell(manager, subject.unit) if subject.is_loaded else None
+    row = subject_row(manager, scope, subject)
+    found = partial(examine, reach, scope)
+    return Evidence(manager, scope, report, row, cell, want_journal, found)
+
+
+class Failure(NamedTuple):
+    """What a bundle is about that nobody has requested, for its event."""
+
+    event: str  # one of ORDER of decisions/notice/happened.py
+    details: dict[str, str]
+
+
+def write_after(
+    reach: Callable[[Scope], Manager],
+    scope: Scope,
+    cell: Cell,
+    box: BlackBox,
+    failure: Failure,
+    now_us: Callable[[], int] = _now_us,
+) -> str:
+    """Write a bundle after a failure, within the bounds of the setting; return its path, or "".
+
+    Never raises DoraSystemdError: a bundle that is not written is an event.
+    """
+    try:
+        path, problem = _written_after(reach, scope, cell, box, failure, now_us()), ""
+    except DoraSystemdError as error:
+        path, problem = "", error.message
+    details = {"scope": scope.word, **failure.details}
+    details |= {"reason": problem} if problem else {"file": path}
+    event = BUNDLE_REFUSED if problem else BUNDLE_WRITTEN
+    note_request(event, cell.name, cell.uuid, BY, **details)
+    return path
+
+
+def _written_after(
+    reach: Callable[[Scope], Manager],
+    scope: Scope,
+    cell: Cell,
+    box: BlackBox,
+    failure: Failure,
+    now_us: int,
+) -> str:
+    """Write the bundle; return its path. Raises DoraSystemdError."""
+    what = _evidence(reach, scope, cell.uuid, want_journal=True)
+    manifest = replace(_manifest(what, BY), event=failure.event)
+    store = BundleStore(scope.state_root, cell.name)
+    with locked(store), _explained(store.path):
+        store.remove_partial()
+        past = [_past(one) for one in store.known() if one.event != REQUESTED]
+        if is_too_soon(past, manifest.node, manifest.cause, now_us):
+            about = f"node {manifest.node}" if manifest.node else "the same cause"
+            message = f"one about {about} was written less than 10 minutes ago"
+            raise DoraSystemdError(message, "doractl bundle writes one now")
+        store.drop(to_remove(past, box.keep))
+        most = min(box.most, room(store.path))
+        path = store.new_path(time.strftime(_STAMP, time.gmtime()), failure.event)
+        return str(_write(path, most, what, manifest).path)
+
+
+def _past(one: Stored) -> Past:
+    with suppress(DoraSystemdError), opened(one.path) as bundle:
+        known = bundle.manifest
+        return Past(one.id, one.event, known.at_us, known.node, known.cause)
+    return Past(one.id, one.event)
 
 
 def _manifest(what: Evidence, by: str) -> Manifest:

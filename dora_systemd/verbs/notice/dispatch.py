@@ -11,6 +11,7 @@ from dora_systemd.decisions.logs.query import notice_matches, sent_matches
 from dora_systemd.decisions.notice.happened import (
     FAILED,
     FIRST_PAUSE,
+    MOST_ENDS,
     Happened,
     Story,
     next_pause,
@@ -40,7 +41,7 @@ def monotonic_us() -> int:
 def read_journal(journal: JournalReader, scope: Scope, name: str) -> Story:
     """Read what has happened to a dataflow since its last notice. Raises DoraSystemdError."""
     boot, now_us = now_boot(), monotonic_us()
-    last = read_last(journal.newest(sent_matches(scope, name), 1), boot, now_us)
+    last = read_last(journal.newest(sent_matches(scope, name), MOST_ENDS), boot, now_us)
     return read_story(journal.newest(notice_matches(scope, name), None), boot, now_us, last)
 
 

@@ -7,14 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.host.files import write_atomic
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.cell.black_box import BlackBox
 from dora_systemd.decisions.logs.journal_events import NOTICE_FAILED, NOTICE_SENT
 from dora_systemd.decisions.notice.command import unit_of, words_of
 from dora_systemd.decisions.notice.happened import (
     Happened,
     format_environment,
+    main_one,
     summary,
     variables,
 )
@@ -56,6 +59,11 @@ class Sender:
     def send(self, happened: Sequence[Happened], pause_us: int) -> None:
         """Run the command of the setting, and record the notice, whatever came of it."""
         cell = read_cell(self._manager, unit_name(self._name))
+        box = cell.options.of_dataflow("black_box") if cell else None
+        if cell and box:
+            self._write_bundle(cell, box, happened, pause_us)
+        if cell and box and not cell.options.has("on_failure"):
+            return None
         if cell is None or not cell.options.has("on_failure"):
             return self._record("", happened, pause_us, "the dataflow has no on_failure any more")
         node = self._write_report(cell, happened)
@@ -64,6 +72,20 @@ class Sender:
         except DoraSystemdError as error:
             problem = error.message
         return self._record(cell.uuid, happened, pause_us, problem, node)
+
+    def _write_bundle(
+        self, cell: Cell, box: BlackBox, happened: Sequence[Happened], pause_us: int
+    ) -> None:
+        """Write a bundle of the newest failure, or record why there is none."""
+        # Imported late: it has all that doctor checks, and most notices need none.
+        from dora_systemd.verbs.bundles.write import Failure, write_after
+
+        details = {"until": str(happened[0].mono_us), "pause": str(pause_us)}
+        failure = Failure(main_one(happened).what, details)
+        write_after(self._reach, self._scope, cell, box, failure)
+
+    def _reach(self, scope: Scope) -> Manager:
+        return self._manager if scope == self._scope else Bus(scope, for_reading=True)
 
     def _write_report(self, cell: Cell, happened: Sequence[Happened]) -> str:
         """Write the report of `doractl why`, as text and JSON; return the node that it names."""

@@ -212,7 +212,7 @@ def _roll_back(attempt: _Attempt, fault: Fault, mark: _Mark) -> DoraSystemdError
 
 def _request_notice(manager: Manager, options: RunnerOptions) -> None:
     """Start the service that sends notices, if the dataflow has any. Its absence fails nothing."""
-    if options.has("on_failure"):
+    if options.is_noticed:
         with suppress(DoraSystemdError):
             manager.queue_job("StartUnit", notice_unit(options.name))
 

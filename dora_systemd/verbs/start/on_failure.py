@@ -40,16 +40,17 @@ def find_command(
 
 def check_units(manager: Manager, scope: Scope, options: RunnerOptions) -> None:
     """Raise DoraSystemdError (BAD_INPUT) if systemd does not know a unit that a notice needs."""
-    if not options.has("on_failure"):
+    if not options.is_noticed:
         return
     hint = f"install it: doractl {scope.flag} setup"
-    _check_unit(manager, notice_unit(options.name), hint)
+    key = "on_failure" if options.has("on_failure") else "black_box"
+    _check_unit(manager, notice_unit(options.name), hint, key)
     if unit := unit_of(words_of(options), options.name):
         _check_unit(manager, unit, "see systemctl list-unit-files")
 
 
-def _check_unit(manager: Manager, unit: str, hint: str) -> None:
+def _check_unit(manager: Manager, unit: str, hint: str, key: str = "on_failure") -> None:
     state = str(manager.read(unit, ["LoadState"])["LoadState"])
     if state != "loaded":
-        message = f"cannot use on_failure: unit {unit} is {state}"
+        message = f"cannot use {key}: unit {unit} is {state}"
         raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

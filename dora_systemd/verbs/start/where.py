@@ -177,7 +177,7 @@ def find_where(
     )
     options = with_settings(options, settings)
     if options.machine:
-        options = options.without("on_failure")  # the head sends the notices
+        options = options.without("on_failure", "black_box")  # the head sends and writes
     if words := words_of(options):
         found = find_command(words, look.sight, look.user, search_path)
         options = options.with_value("on_failure", found)

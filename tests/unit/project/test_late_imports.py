@@ -21,6 +21,9 @@ LATE = {
             *("verbs.releases.listing", "verbs.releases.rollback", "verbs.bundles.write"),
         },
     },
+    "most notices come without a bundle, which needs all that doctor checks": {
+        "verbs.notice.send": {"verbs.bundles.write"},
+    },
     "a report of what this machine knows reads no bundle": {
         "cli.verbs.look.why": {"verbs.bundles.listing"},
     },

@@ -64,6 +64,19 @@ def test_each_failure_of_the_unit_counts_once_with_its_cause() -> None:
     ]
 
 
+def test_a_bundle_of_a_failure_counts_as_a_notice_and_a_requested_one_does_not() -> None:
+    requested = record(998, DORA_EVENT="bundle-written", DORA_FILE="/x")
+    assert len(read_story([requested, unit_failed(997, "1")], "b", NOW)[0]) == 1
+    last = read_last([requested, sent(997, 996)], "b", NOW)
+    assert last
+    assert last.mono_us == 997 * SECOND
+    for event in ("bundle-written", "bundle-refused"):
+        found, last = read_story([sent(998, 997, event), unit_failed(997, "1")], "b", NOW)
+        assert found == []
+        assert last
+        assert last.mono_us == 998 * SECOND
+
+
 def test_a_failure_that_the_runner_could_not_record() -> None:
     (one,) = read_story([unit_failed(999, "1")], "b", NOW)[0]
     assert (one.what, one.node, one.cause) == ("failed", "", "")

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dora_systemd.decisions.cell.black_box import BlackBox
 from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.stops import NodeStop
@@ -221,6 +222,7 @@ def test_values_and_back(data: st.DataObject) -> None:
         "stop_limit": st.integers(0, 2**60),
         "stop": st.builds(NodeStop, st.just(""), st.integers(1, 2**60), st.just(("arm", "cam"))),
         "on_failure": st.just(("/bin/x", "a b", "$c")) | st.just(("unit:tell@.service",)),
+        "black_box": st.sampled_from([None, BlackBox(), BlackBox(2, 8 << 20)]),
         "record": st.sampled_from([None, Record(), Record(SECOND, 1 << 20, ("cam/image",))]),
         "owes": st.just((Owed("cam", "image", 2 * SECOND),)) | st.just(()),
         "log_rate_limit": st.dictionaries(

@@ -1,11 +1,14 @@
 """`doractl bundle` of a dataflow that only the journal knows, and what is printed of it."""
 
+import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.adapters.bundles.reader import opened
+from dora_systemd.decisions.cell.black_box import BlackBox
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.bundles.listing import (
@@ -16,7 +19,8 @@ from dora_systemd.verbs.bundles.listing import (
     read_report,
     remove_bundles,
 )
-from dora_systemd.verbs.bundles.write import write_bundle
+from dora_systemd.verbs.bundles.write import Failure, write_after, write_bundle
+from dora_systemd.verbs.facts.cells import read_cell
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
@@ -95,3 +99,31 @@ def test_an_unknown_one(reach: Reach, scope: ScopeIn) -> None:
         write_bundle(reach, scope, "rover", "x")
     with pytest.raises(DoraSystemdError, match="has no bundle x"):
         list(remove_bundles(scope, "robot", ["x"]))
+
+
+def test_bundles_of_failures_are_bounded(
+    reach: Reach, scope: ScopeIn, manager: FakeManager
+) -> None:
+    """One of the same node and cause in ten minutes; those that were requested do not count."""
+    requested = write_bundle(reach, scope, "robot", "doractl bundle").path
+    cell, box, now = read_cell(manager, "dora-robot.service"), BlackBox(2, 20 << 20), time.time()
+    assert cell
+    paths = []
+    for minutes in (0, 5, 11, 22):
+        failure = Failure("failed", {"until": "1", "pause": "2"})
+        at_us = int(now + 60 * minutes) * 1_000_000
+        paths.append(write_after(reach, scope, cell, box, failure, partial(int, at_us)))
+    assert [bool(one) for one in paths] == [True, False, True, True]
+    left = {row.id for row in read_bundles(scope, ["robot"])}
+    assert left == {requested.name, *(Path(one).name for one in paths[2:])}
+
+
+def test_a_bundle_that_cannot_be_written_is_an_event(
+    reach: Reach, scope: ScopeIn, manager: FakeManager
+) -> None:
+    scope.state_root.parent.mkdir(parents=True)
+    scope.state_root.touch()
+    cell = read_cell(manager, "dora-robot.service")
+    assert cell
+    failure = Failure("failed", {})
+    assert write_after(reach, scope, cell, BlackBox(), failure) == ""
