@@ -5,6 +5,7 @@ import json
 import os
 import random
 import signal
+import tarfile
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,86 @@ def test_it_is_changed_while_it_runs(cell: Cell, project: Project) -> None:
     cell.doractl("restart", cell.name)
     wait_for("it goes on", partial(has_more, 20))
     assert Ring().reading().header.budget == 4 * 1024 * 1024
+
+
+FAST = """
+import os
+from dora import Node
+import pyarrow as pa
+node = Node()
+data = pa.array(memoryview(os.urandom(1_000_000)), type=pa.uint8())
+while True:
+    if node.try_recv() is not None:
+        break
+    node.send_output("image", data)
+"""
+STUCK = """
+import os, signal
+from dora import Node
+node = Node()
+node.next()
+os.kill(os.getpid(), signal.SIGSTOP)
+"""
+FAST_FLOW = """
+nodes:
+  - {id: camera, path: camera.py, outputs: [image]}
+  - {id: sink, path: sink.py, inputs: {image: camera/image}}
+"""
+MESSAGES = int(os.environ.get("MESSAGES", "200"))
+
+
+@pytest.mark.warns(
+    LARGE, "Discarding", "grace", "exited with error", "sink", "NextEvent", "on drop"
+)
+def test_memory_is_bounded_though_a_consumer_is_stopped(cell: Cell, project: Project) -> None:
+    project.write("camera.py", FAST)
+    project.write("sink.py", STUCK)
+    path = project.write("flow.yml", FAST_FLOW)
+    start(cell, path, "--record", "memory=8M,outputs=camera/image", "--grace-duration", "1s")
+
+    def is_done() -> bool:
+        ring = Ring()
+        assert not ring or ring.used <= 8.2 * 1024 * 1024
+        return bool(ring) and ring.reading().states[0].received > MESSAGES
+
+    wait_for("many messages were recorded", is_done, 60 + MESSAGES / 10)
+    assert 5 <= len(file_of(Ring()).messages) <= 8
+
+
+PICTURES = """
+import time
+from dora import Node
+import pyarrow as pa
+node = Node()
+for event in node:
+    if event["type"] == "INPUT":
+        metadata = {"encoding": "rgb8", "width": 4, "height": 2}
+        node.send_output("image", pa.array(range(24), type=pa.uint8()), metadata)
+"""
+PICTURES_FLOW = """
+nodes:
+  - {id: camera, path: camera.py, inputs: {tick: dora/timer/millis/20}, outputs: [image]}
+"""
+
+
+def test_a_bundle_has_the_messages_and_pictures(cell: Cell, project: Project) -> None:
+    project.write("camera.py", PICTURES)
+    start(cell, project.write("flow.yml", PICTURES_FLOW), "--record", "yes")
+    wait_for("it records", partial(has_more, 20))
+    bundle = project.root / "robot.tar"
+    cell.doractl("bundle", cell.name, "-o", str(bundle), "--images")
+    with tarfile.open(bundle) as archive:
+        names = archive.getnames()
+        (recording,) = (one for one in names if one.endswith("recording.mcap"))
+        found = archive.extractfile(recording)
+        assert found is not None
+        file = File(found.read())
+    assert len(file.messages) > 40
+    assert file.messages[0].topic == "camera/image"
+    assert sum("images/camera-image/" in one and one.endswith(".png") for one in names) == 10
+    cell.doractl("bundle", cell.name, "-o", str(bundle), "--no-journal")
+    with tarfile.open(bundle) as archive:
+        assert not [one for one in archive.getnames() if "recording" in one]
 
 
 ROUNDS = int(os.environ.get("KILLS", "4"))

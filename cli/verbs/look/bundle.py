@@ -16,8 +16,9 @@ from dora_systemd.verbs.bundles.write import write_bundle
 @click.argument("selector")
 @click.option("-o", "--output", "file", metavar="FILE", help="Write it there.")
 @click.option("--no-journal", is_flag=True, help="Leave out everything that nodes have written.")
+@click.option("--images", is_flag=True, help="Also write recorded pictures as files.")
 @scope_options
-def command(selector: str, file: str | None, no_journal: bool) -> int:
+def command(selector: str, file: str | None, no_journal: bool, images: bool) -> int:
     """Write a tar file about a dataflow: what `why` says, its journal, unit, nodes and limits.
 
     It never has values of variables, arguments, settings or credentials. What nodes have written
@@ -27,13 +28,14 @@ def command(selector: str, file: str | None, no_journal: bool) -> int:
     Examples:
       doractl bundle robot
       doractl bundle robot -o robot.tar --no-journal
+      doractl bundle robot --images
       doractl why --bundle robot.tar
     """
     scope = current_scope()
     check_readable(scope)
     place = Path(file).absolute() if file else None
     reach = partial(Bus, for_reading=True)
-    done = write_bundle(reach, scope, selector, "doractl bundle", place, not no_journal)
+    done = write_bundle(reach, scope, selector, "doractl bundle", place, not no_journal, images)
     print_warnings(f"not in the bundle: {one}" for one in done.errors)
     click.echo(str(done.path))
     return ExitCode.OK

@@ -14,7 +14,8 @@ _FILES = (
     ("nodes.json", "the nodes as the runner sees them"),
     ("doctor.json", "the findings of doractl doctor"),
     ("stacks/", "the stack of a node that a signal has ended"),
-    ("recording.mcap", "the last messages of outputs"),
+    ("recording.mcap", "the last messages of outputs, see RECORDER in dora-systemd-nodes(7)"),
+    ("images/", "the last recorded pictures"),
     ("errors.txt", "what could not be collected"),
     ("manifest.json", "size and digest of each file, versions, what was left out"),
 )
@@ -22,7 +23,7 @@ ANNOUNCEMENT = (
     "The journal, the last lines above and the recording are what nodes have written and sent, and "
     "nothing is removed from that: a secret that a node has written to its log is in this bundle."
 )
-_WITHOUT = "The journal and the lines of nodes were left out, as requested by --no-journal."
+_WITHOUT = "What nodes have written and sent was left out, as requested by --no-journal."
 _RULES = (
     "Never in a bundle: values of environment variables, arguments of nodes and of doractl, "
     "settings, credentials, addresses of repositories."

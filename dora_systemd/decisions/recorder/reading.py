@@ -1,11 +1,12 @@
 """Reads a ring, while its recorder writes to it or after the end of that.
 
-The nodes' user can write to the ring. A reader reads at most `most` bytes of messages, believes no
-length, and gives up a tape at the first record that is none. What it returns is bytes and numbers:
-nobody but the program that reads the file interprets Arrow.
+The nodes' user can write to the ring. A reader reads at most `most` bytes of messages, the newest,
+believes no length, and gives up a tape at the first record that is none. What it returns is bytes
+and numbers; only pictures.py interprets Arrow.
 """
 
 import heapq
+from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple, Protocol
 
@@ -23,6 +24,8 @@ from dora_systemd.decisions.recorder.ring import (
     size_of,
 )
 
+MOST_RECORDS = 2_000_000
+"""Messages that are read: reading as many takes half a minute."""
 _TRIES = 8
 """Reads of a state that its recorder writes at the same time."""
 
@@ -56,7 +59,10 @@ class Reading:
         if size != size_of(self.header):
             raise ValueError("its size does not fit its header")
         self._states = [self._state(at) for at in range(len(self.header.outputs))]
-        self._left = most
+        windows = sum(max(one.head - one.tail, 0) for one in self.states)
+        if windows > self.header.budget:
+            raise ValueError("it has more than its budget")
+        self._most, self._skipped = most, max(windows - most, 0)
         self.damaged = 0
         """Messages that could not be read, at least."""
         self.is_cut = False
@@ -77,32 +83,34 @@ class Reading:
 
     def messages(self) -> Iterator[Recorded]:
         """All messages, in the order in which the recorder has received them."""
-        seen = set[int]()
+        seen, count = set[int](), 0
         tapes = (self._walk(at, state) for at, state in enumerate(self.states))
         for output, head, position, crc in heapq.merge(*tapes, key=lambda one: one[1].number):
-            self._left -= head.size
-            if self._left < 0:
+            count += 1
+            if count > MOST_RECORDS:
                 self.is_cut = True
-                return
+                break
+            if self._skipped > 0:
+                self._skipped -= head.size
+                self.is_cut = True
+                continue
             if message := self._message(output, head, position, crc):
                 seen.add(output)
                 yield message
             elif self._tail(output) <= position:
                 self.damaged += 1
         for output in range(len(self._states)):
-            # All messages of an output that has few can have been replaced meanwhile.
+            # Those of an output that has few can have been replaced meanwhile, or are the oldest.
             if output not in seen and (message := self._newest(output)):
                 yield message
 
     def _newest(self, at: int) -> Recorded | None:
         for _ in range(_TRIES):
-            state, _schema = self._state(at)
-            for output, head, position, crc in self._walk(at, state):
-                if head.size > self._left:
-                    self.is_cut = True
+            last = deque(self._walk(at, self._state(at)[0]), maxlen=1)
+            for output, head, position, crc in last:
+                if head.size > self._most:
                     return None
                 if message := self._message(output, head, position, crc):
-                    self._left -= head.size
                     return message
         return None
 

@@ -34,6 +34,7 @@ from dora_systemd.decisions.why.lives import plain_text
 from dora_systemd.decisions.why.report import Report, report_object
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_table
+from dora_systemd.verbs.bundles import recording
 from dora_systemd.verbs.facts.cells import Cell
 
 MOST_RECORDS = 30_000
@@ -55,6 +56,7 @@ class Evidence:
     cell: Cell | None
     want_journal: bool
     examine: Callable[[], Iterable[Finding]]  # doctor's
+    want_pictures: bool = False
     # what is not in the bundle, and why; a section may add to it while it is written
     left_out: list[str] = field(default_factory=list)
 
@@ -82,13 +84,16 @@ def sections_of(what: Evidence) -> list[Section]:
     if what.report.stack and what.want_journal:
         name = f"stacks/{what.report.verdict.node or 'node'}.txt"
         found.append(Section(name, lambda sink: _put_lines(sink, map(str, what.report.stack))))
-    return [*found, *recording(what)]
+    return [*found, *_recording(what)]
 
 
-def recording(what: Evidence) -> list[Section]:
+def _recording(what: Evidence) -> list[Section]:
     """The sections of the recorder, with the last messages of outputs."""
-    what.left_out.append("recording.mcap: nothing was recorded")
-    return []
+    if not what.want_journal:
+        what.left_out.append(f"{recording.RECORDING}: --no-journal")
+        return []
+    ring = recording.find(what.manager, what.scope, what.cell, what.report.subject.uuid)
+    return recording.sections(ring, what.left_out, what.want_pictures)
 
 
 def _put_json(sink: Sink, value: Any) -> None:

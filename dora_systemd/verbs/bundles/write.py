@@ -77,12 +77,13 @@ def write_bundle(
     command: str,
     file: Path | None = None,
     want_journal: bool = True,
+    want_pictures: bool = False,
 ) -> Written:
     """Write a bundle of the dataflow to `file`, by default to its store. Raises DoraSystemdError.
 
     reach: opens the connection to systemd. command: that requests it, such as "doractl bundle".
     """
-    what = _evidence(reach, scope, selector, want_journal)
+    what = _evidence(reach, scope, selector, want_journal, want_pictures)
     subject = what.report.subject
     manifest = _manifest(what, requester(command))
     if file is not None:
@@ -100,7 +101,11 @@ def write_bundle(
 
 
 def _evidence(
-    reach: Callable[[Scope], Manager], scope: Scope, selector: str, want_journal: bool
+    reach: Callable[[Scope], Manager],
+    scope: Scope,
+    selector: str,
+    want_journal: bool,
+    want_pictures: bool = False,
 ) -> Evidence:
     """Find the dataflow, and what is known of it. Raises DoraSystemdError."""
     manager = reach(scope)
@@ -109,7 +114,7 @@ def _evidence(
     cell = read_cell(manager, subject.unit) if subject.is_loaded else None
     row = subject_row(manager, scope, subject)
     found = partial(examine, reach, scope)
-    return Evidence(manager, scope, report, row, cell, want_journal, found)
+    return Evidence(manager, scope, report, row, cell, want_journal, found, want_pictures)
 
 
 class Failure(NamedTuple):

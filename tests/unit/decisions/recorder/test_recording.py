@@ -11,6 +11,7 @@ from dora_systemd.decisions.recorder.mcap import MOST_CHANNELS, McapWriter
 from dora_systemd.decisions.recorder.reading import Reading
 from dora_systemd.decisions.recorder.recording import Written, write_recording
 from dora_systemd.decisions.recorder.writer import Message
+from tests.unit.checkout import CHECKOUT
 from tests.unit.fakes.recorder.mcap import File
 from tests.unit.fakes.recorder.ring import PAGE, MemoryStore, message, ring, writer
 
@@ -94,19 +95,12 @@ def test_every_file_is_whole(messages: list[tuple[int, bytes, int, int, int]]) -
 
 
 def ten_lines(path: str) -> list[Any]:
-    """What a user types."""
-    found = []
-    # fmt: off
-    import pyarrow as pa
-    from mcap.reader import make_reader
-
-    with open(path, "rb") as file:  # noqa: PTH123
-        for schema, channel, message in make_reader(file).iter_messages():
-            if channel.message_encoding == "arrow":
-                names = pa.ipc.read_schema(pa.py_buffer(schema.data))
-                batch = pa.ipc.read_record_batch(pa.py_buffer(message.data), names)
-                found.append((channel.topic, message.log_time, batch.column("value")))
-    # fmt: on
+    """Run the ten lines of dora-systemd-nodes(7)."""
+    page = (CHECKOUT / "packaging/man/dora-systemd-nodes.7").read_text()
+    code = page[page.index("import pyarrow as pa") :].partition("\n.Ed")[0]
+    assert len(code.splitlines()) == 9
+    found: list[Any] = []
+    exec(code.replace("recording.mcap", path), {"print": lambda *words: found.append(words)})
     return found
 
 

@@ -14,7 +14,9 @@ from dora_systemd.decisions.recorder.ring import (
     MAGIC,
     SMALL,
     Header,
+    State,
     format_header,
+    format_state,
     parse_header,
     read_state,
     span_of,
@@ -183,7 +185,7 @@ def test_a_ring_that_anybody_has_changed_is_read_within_bounds(data: st.DataObje
         messages, _ = read(store, 20_000)
     except ValueError:
         return
-    assert sum(m.head.size for m in messages) <= 20_000
+    assert sum(m.head.size for m in messages) <= 2 * 20_000
     writer(store).put(0, message(b"and it goes on"))
     assert datas(store)[-1] == b"and it goes on"
 
@@ -194,7 +196,28 @@ def test_a_reader_reads_no_more_than_it_was_told() -> None:
     for _ in range(5):
         one.put(0, message(bytes(1000)))
     messages, reading = read(store, 2500)
-    assert (len(messages), reading.is_cut) == (2, True)
+    assert [m.head.number for m in messages] == [4, 5], "the newest"
+    assert reading.is_cut
+
+
+def test_of_each_output_the_last_message_is_read_though_it_is_old() -> None:
+    store, _ = ring()
+    one = writer(store)
+    one.put(1, message(b"long ago"))
+    for _ in range(5):
+        one.put(0, message(bytes(1000)))
+    messages, _ = read(store, 2500)
+    assert [m.head.number for m in messages] == [5, 6, 1]
+
+
+def test_a_ring_that_claims_more_than_its_budget() -> None:
+    store, header = ring(budget=8 * PAGE)
+    writer(store)
+    for at in range(2):
+        state = State(head=header.budget - 8, version=9)
+        store.write(state_at(at), [format_state(state, b"")])
+    with pytest.raises(ValueError, match="more than its budget"):
+        read(store)
 
 
 def test_a_damaged_message_is_counted() -> None:
