@@ -27,6 +27,10 @@ RESERVE = 64 * 1024
 class Sink(Protocol):
     """Where a section writes, one piece after the other."""
 
+    @property
+    def left(self) -> int:
+        """Bytes that the bundle has room for."""
+
     def write(self, data: bytes, /) -> int:
         """Write all of `data`. Raises DoraSystemdError if the bundle becomes too large."""
 
@@ -47,6 +51,10 @@ class _Bounded:
     def __init__(self, file: BinaryIO, most: int) -> None:
         self._file, self._most = file, most
         self.size, self.digest = 0, hashlib.sha256()
+
+    @property
+    def left(self) -> int:
+        return max(self._most - self.size, 0)
 
     def write(self, data: bytes, /) -> int:
         self.size += len(data)

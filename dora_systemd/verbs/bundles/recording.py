@@ -17,7 +17,7 @@ from dora_systemd.verbs.facts.cells import Cell
 
 RECORDING = "recording.mcap"
 _MOST_BYTES = 192 * 1024 * 1024
-"""Bytes of messages, the newest: the bundle has more than them."""
+"""Bytes of messages in which pictures are searched, the newest."""
 
 
 def find(manager: Manager, scope: Scope, cell: Cell | None, uuid: str) -> RingFile | None:
@@ -55,11 +55,30 @@ def _managers(manager: Manager, scope: Scope) -> list[int]:
 
 def _put(ring: RingFile, left_out: list[str], sink: Sink) -> None:
     with closing(ring):
-        written = write_recording(Reading(ring, ring.size, _MOST_BYTES), sink.write, {})
+        most = _fitting(ring, sink.left)
+        written = write_recording(Reading(ring, ring.size, most), sink.write, {})
     if written.is_cut:
         left_out.append(f"{RECORDING}: older messages")
     if written.damaged:
         left_out.append(f"{RECORDING}: {written.damaged} damaged messages")
+
+
+def _fitting(ring: RingFile, left: int) -> int:
+    """Bytes of the newest messages of which the file has at most `left` bytes.
+
+    The file has numbers of each message, and the last message of each output in any case.
+    """
+    most = left * 3 // 4
+    while ring.used > most > 0 and _file_size(ring, most) > left:
+        most //= 2
+    return most
+
+
+def _file_size(ring: RingFile, most: int) -> int:
+    sizes: list[int] = []
+    reading = Reading(ring, ring.size, most)
+    write_recording(reading, lambda data: sizes.append(len(data)), {})
+    return sum(sizes)
 
 
 def _pictures(ring: RingFile) -> list[Picture]:

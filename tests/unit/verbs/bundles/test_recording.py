@@ -26,7 +26,15 @@ IMAGE = {"encoding": "rgb8", "width": 4, "height": 2}
 
 
 class Sink(io.BytesIO):
-    """A part of a bundle."""
+    """A part of a bundle. most: bytes that it may have."""
+
+    def __init__(self, most: int = 1 << 30) -> None:
+        super().__init__()
+        self.most = most
+
+    @property
+    def left(self) -> int:
+        return self.most - self.tell()
 
 
 @pytest.fixture
@@ -63,6 +71,20 @@ def test_the_messages_and_their_pictures(ring: int) -> None:
     assert parts["images/camera-image/000001.png"].startswith(b"\x89PNG")
     assert left_out == []
     assert list(written(want_pictures=False)[0]) == ["recording.mcap"]
+
+
+@pytest.mark.parametrize("size", [100, 40_000])
+def test_the_newest_messages_that_fit(ring: int, size: int) -> None:
+    store = Writer(FileStore(ring), PAGE)
+    for number in range(400_000 // size):
+        store.put(0, message(number.to_bytes(4, "little") + bytes(size), 6 + number, SCHEMA))
+    left_out, sink = list[str](), Sink(200_000)
+    (section,) = recording.sections(found(), left_out, want_pictures=False)
+    section.write(sink)
+    assert 60_000 < len(sink.getvalue()) <= 200_000
+    last = File(sink.getvalue()).messages[-1].data[:4]
+    assert int.from_bytes(last, "little") == 400_000 // size - 1
+    assert left_out == ["recording.mcap: older messages"]
 
 
 def test_without_a_recorder_it_is_left_out() -> None:
