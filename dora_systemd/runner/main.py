@@ -27,6 +27,7 @@ from dora_systemd.decisions.cell.launch import kinds, watchdogs_of
 from dora_systemd.decisions.cell.limits import limits_of
 from dora_systemd.decisions.cell.line_rates import rates_of
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.restarts import restart_of
 from dora_systemd.decisions.cell.stops import named_stops
 from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
@@ -99,6 +100,7 @@ async def run_cell(
     fd_store.forget_inherited()
     origin = Origin(options.name, options.uuid)
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
+    end: RunnerExit | None = None
     try:
         if spent:
             raise spent
@@ -106,7 +108,8 @@ async def run_cell(
         runs = Runs(given, options, paths, pipes, clock, begun, this_life)
         if ring >= 0 or options.has("record"):
             runs.keep_ring(ring)
-        return await live(runs, losses_of_user(journal, pipes) if paths.is_of_user else None)
+        end = await live(runs, losses_of_user(journal, pipes) if paths.is_of_user else None)
+        return end
     except DoraSystemdError as error:
         cause = Cause.RESTARTS_SPENT if error is spent else Cause.BAD_DATAFLOW
         tell_failure(pipes, error, cause)
@@ -118,6 +121,9 @@ async def run_cell(
     finally:
         pipes.close(clock.left(JOURNAL_SECONDS if clock.by else CLOSE_SECONDS))
         journal.wait_read(clock.left(JOURNAL_SECONDS))
+        is_over = clock.by or (end is RunnerExit.OK and restart_of(options).policy != "always")
+        if is_over and options.has("record"):
+            fd_store.forget_all(pipes.kept)
 
 
 class Runs:

@@ -241,6 +241,14 @@ def _killed(scope: Scope, cell: Cell, begin: int) -> str:
     return f"killed after {after}: {', '.join(nodes)}" if nodes else ""
 
 
+def _let_go(manager: Manager, unit: str) -> None:
+    """Clear the failure of a unit, and close what systemd keeps of a recorder that has failed."""
+    manager.reset_failed(unit)
+    facts = manager.read(unit, ["ActiveState", "NFileDescriptorStore"])
+    if facts["ActiveState"] in DOWN and facts["NFileDescriptorStore"]:
+        manager.close_stored(unit)
+
+
 def _stopped(cell: Cell, note: str) -> str:
     return f"Dataflow stopped: {cell.uuid} ({cell.name}){note and f': {note}'}"
 
@@ -251,7 +259,7 @@ def _not_running(cell: Cell) -> Outcome:
 
 def _reset(manager: Manager, cell: Cell) -> Outcome:
     used = read_restarts(manager, cell)
-    manager.reset_failed(cell.unit)
+    _let_go(manager, cell.unit)
     return Outcome(
         cell, f"Dataflow reset: {cell.uuid} ({cell.name}, restart counter reset, was {used})"
     )
@@ -278,7 +286,7 @@ def _ended(manager: Manager, one: _Stop, state: str) -> Ended:
     note = ""
     if one.is_killed:
         with suppress(DoraSystemdError):
-            manager.reset_failed(one.cell.unit)
+            _let_go(manager, one.cell.unit)
         note = "killed"
     elif state == "failed":
         note = failure_reason(manager, one.cell.unit)

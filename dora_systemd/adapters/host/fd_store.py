@@ -7,6 +7,7 @@ FileDescriptorStoreMax= in systemd.service(5).
 import contextlib
 import os
 import socket
+from collections.abc import Iterable
 
 from dora_systemd.decisions.cell.restarts import MOST_COUNTED
 
@@ -124,6 +125,15 @@ def forget_inherited() -> None:
     for name in sorted({*names}):
         if name.startswith(PREFIX):
             _forget(name)
+
+
+def forget_all(nodes: Iterable[str]) -> None:
+    """Have systemd close everything at the end of a unit with FileDescriptorStorePreserve=yes.
+
+    nodes: those with pipes. systemd would keep the unit as long as the descriptors.
+    """
+    for name in (*(PREFIX + node for node in nodes), PREFIX, LIFE, RING):
+        _forget(name)
 
 
 def _send(text: str, fds: list[int]) -> None:

@@ -194,6 +194,11 @@ class LogPipes:
         each = self._sources.items()
         return whole | {node: LineCount(one.written, one.suppressed) for node, one in each}
 
+    @property
+    def kept(self) -> list[str]:
+        """The nodes with pipes that must survive this process."""
+        return [*self._paths]
+
     def is_busy(self, node: str) -> bool:
         """Whether entries of the node still wait for journald."""
         return self._queue.waiting(node) > 0

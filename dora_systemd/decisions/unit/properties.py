@@ -87,6 +87,7 @@ def unit_properties(
         **credential_properties(context.credentials),
         **user_properties(context),
         **log_properties(options, context),
+        **ring_properties(options),
         **(sandbox_properties(context.sandbox) if context.sandbox else {}),
         **realtime_properties(settings),
         **rights_properties(rights_of(options)),
@@ -142,6 +143,15 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
 def _command(argv: Sequence[str], *flags: str) -> Sequence[Command]:
     # ":" in a unit file: a "$" in a path stays as it is.
     return ((argv[0], tuple(argv), (*flags, "no-env-expand")),)
+
+
+def ring_properties(options: RunnerOptions) -> dict[str, Property]:
+    """Keep the ring of the recorder when the unit has finally failed, for the bundle after that.
+
+    The runner has systemd close all of it when the unit ends in another way, see fd_store.py.
+    """
+    has_ring = options.has("record") and options.of_dataflow("record") is not None
+    return typed(FileDescriptorStorePreserve="yes") if has_ring else {}
 
 
 def stop_properties(options: RunnerOptions) -> dict[str, Property]:

@@ -45,6 +45,8 @@ _PLAIN_FLAGS = frozenset({"ignore-failure", "no-env-expand"})
 _SILENT = {
     # The runner creates the group and moves into it if systemd does not.
     "DelegateSubgroup": "supervisor",
+    # RECORDER in dora-systemd-nodes(7) has what a recorder lacks without it.
+    "FileDescriptorStorePreserve": "yes",
     # The sandbox uses this value if possible, see dora-systemd-security(7).
     "PrivateUsers": "identity",
 }

@@ -35,6 +35,12 @@ def test_store(manager: socket.socket) -> None:
     assert manager.recv(100) == b"FDSTOREREMOVE=1\nFDNAME=dora-log-m1.camera"
 
 
+def test_all_is_forgotten(manager: socket.socket) -> None:
+    fd_store.forget_all(["camera"])
+    names = [manager.recv(100).decode().partition("FDNAME=")[2] for _ in range(4)]
+    assert names == ["dora-log-camera", "dora-log-", "dora-life", "dora-ring"]
+
+
 def test_without_systemd(manager: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     for key in ("LISTEN_PID", "LISTEN_FDNAMES", "LISTEN_FDS"):
         monkeypatch.delenv(key, raising=False)
