@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.bundles.archive import PARTIAL
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import format_rounded_size, shown
 
 BUNDLES = "dora-systemd/bundles"
@@ -52,7 +53,7 @@ class BundleStore:
     def known(self) -> list[Stored]:
         """Return all bundles, oldest first. Raises DoraSystemdError (NO_PERMISSION)."""
         try:
-            names = os.listdir(self.path)[:_MOST_NAMES]  # noqa: PTH208 - names only
+            names = list_directory(self.path, _MOST_NAMES)
         except (FileNotFoundError, NotADirectoryError):
             return []
         except OSError as error:

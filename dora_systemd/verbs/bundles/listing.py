@@ -1,7 +1,6 @@
 """`doractl bundles`: the bundles in the store; `doractl why --bundle`: the report in a bundle."""
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +15,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_name
 from dora_systemd.scope import Scope
 from dora_systemd.terminal_text import cut, one_line
+from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import as_mapping
 from dora_systemd.verbs.facts.selector import Selector
 
@@ -31,7 +31,7 @@ def kept_names(scope: Scope) -> list[str]:
     """The dataflows with bundles, sorted. Raises DoraSystemdError (NO_PERMISSION)."""
     root = store_of(scope, "").root
     try:
-        return sorted(filter(is_name, os.listdir(root)))[:_MOST_NAMES]  # noqa: PTH208 - names only
+        return [*filter(is_name, list_directory(root, _MOST_NAMES))]
     except (FileNotFoundError, NotADirectoryError):
         return []
     except OSError as error:

@@ -66,7 +66,7 @@ _TABLE = {
     ROOTS: """
         adapters.bus.connection adapters.host.unit_files
         adapters.host.guard
-        adapters.bundles.archive adapters.bundles.store verbs.bundles.listing
+        adapters.bundles.archive adapters.bundles.store
         adapters.releases.draft adapters.releases.transfer
         adapters.releases.store verbs.releases.source verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
