@@ -7,6 +7,7 @@ from dora_systemd.decisions.views.dataflows import is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
+from dora_systemd.verbs.facts.bundles import mark_bundles
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.containers import read_containers
 from dora_systemd.verbs.facts.list import mark_enabled, row_of
@@ -27,7 +28,7 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
     if not wanted.meant(cells) and (row := wanted.ended(scope)):
         from dora_systemd.verbs.facts.ended import with_cause
 
-        return mark_enabled(manager, scope, [with_cause(scope, row)])[0]
+        return mark_bundles(scope, mark_enabled(manager, scope, [with_cause(scope, row)]))[0]
     row = read_whole_rows(manager, scope, [wanted.loaded(cells)])[0]
     if is_up_word(row):
         return row
@@ -52,7 +53,9 @@ def whole_rows(
         )
         for one, row in zip(readings, rows, strict=True)
     ]
-    return mark_inhibited(scope, mark_enabled(manager, scope, found)) if found else []
+    if not found:
+        return []
+    return mark_bundles(scope, mark_inhibited(scope, mark_enabled(manager, scope, found)))
 
 
 def with_containers(reading: Reading, row: DataflowRow) -> DataflowRow:

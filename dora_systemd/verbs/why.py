@@ -28,6 +28,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import read_restarts, restart_budget, without_refused
+from dora_systemd.verbs.facts.bundles import mark_bundles, read_of_failures
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.containers import read_containers
 from dora_systemd.verbs.facts.ended import newest_ended, not_recorded
@@ -69,7 +70,8 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     is_held = cell is not None and _is_held(scope, cell, verdict.node)
     machines = _machines(manager, cell) if cell and cell.options.placed else {}
     more = (last, is_of_trial, stack, keeps_core_dumps(read_pattern()))
-    return Report(subject, verdict, words, budget, inhibitors, is_held, machines, *more)
+    report = Report(subject, verdict, words, budget, inhibitors, is_held, machines, *more)
+    return replace(report, bundles=read_of_failures(scope, subject.name))
 
 
 def explain_now(manager: Manager, scope: Scope, selector: str, journal: JournalReader) -> Report:
@@ -241,7 +243,7 @@ def subject_row(manager: Manager, scope: Scope, subject: Subject) -> DataflowRow
         return read_whole_rows(manager, scope, [cell])[0]
     known = DataflowRow(subject.uuid, subject.name, subject.unit, "", subject.file)
     ended = Selector(subject.uuid).ended(scope) or known
-    return mark_enabled(manager, scope, [ended])[0]
+    return mark_bundles(scope, mark_enabled(manager, scope, [ended]))[0]
 
 
 def _own_matches(scope: Scope, subject: Subject) -> list[str]:

@@ -4,17 +4,20 @@ In system scope all of it is root's, and no node can change or read it.
 """
 
 import fcntl
+import json
 import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
 from dora_systemd.adapters.bundles.archive import PARTIAL
+from dora_systemd.decisions.views.rows import Bundles
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.paths import list_directory
-from dora_systemd.values import format_rounded_size, shown
+from dora_systemd.values import SECOND, as_mapping, format_rounded_size, shown
 
 BUNDLES = "dora-systemd/bundles"
 """The directory of all bundles, below that of states."""
@@ -22,8 +25,13 @@ REQUESTED = "requested"
 """The EVENT of a bundle that was requested."""
 _MOST_NAMES = 10_000
 _ENDING = ".tar"
-_STAMP = re.compile(r"-([0-9]{8}T[0-9]{6}Z(?:\.[0-9]{1,3})?)-([a-z-]{1,40})\.tar")
+STAMP = "%Y%m%dT%H%M%SZ"
+"""The form of the time in a name, for strftime(3)."""
+_NAME = re.compile(r"-([0-9]{8}T[0-9]{6}Z(?:\.[0-9]{1,3})?)-([a-z-]{1,40})\.tar")
 _GIB, _PERCENT = 1 << 30, 15
+_REFUSED = ".refused"
+"""The file that counts the bundles that were not written."""
+_MOST_TEXT = 4096
 LEAST = 1 << 20
 """Bytes below which a bundle would have nothing in it."""
 
@@ -35,6 +43,19 @@ class Stored(NamedTuple):
     stamp: str  # when it was written, such as 20261127T041500Z
     event: str  # what failed, see ORDER in decisions/notice/happened.py, or REQUESTED
     size: int
+
+    @property
+    def place(self) -> tuple[str, int]:
+        """What sorts bundles: the time, and the number of several within a second."""
+        return self.stamp[:16], int(self.stamp[17:] or 0)
+
+    @property
+    def at_us(self) -> int:
+        """The time of `stamp`, CLOCK_REALTIME; 0 if there is no such time."""
+        with suppress(ValueError):
+            moment = datetime.strptime(self.stamp[:16], STAMP).replace(tzinfo=UTC)
+            return int(moment.timestamp()) * SECOND
+        return 0
 
     @property
     def id(self) -> str:
@@ -58,11 +79,11 @@ class BundleStore:
             return []
         except OSError as error:
             raise unusable(self.path, error) from error
-        return sorted(filter(None, map(self._stored, names)), key=lambda one: one.stamp)
+        return sorted(filter(None, map(self._stored, names)), key=lambda one: one.place)
 
     def _stored(self, name: str) -> Stored | None:
         begin, rest = name[: len(self.name)], name[len(self.name) :]
-        found = _STAMP.fullmatch(rest)
+        found = _NAME.fullmatch(rest)
         if begin != self.name or not found:
             return None
         try:
@@ -70,12 +91,34 @@ class BundleStore:
         except OSError:
             return None
 
+    def of_failures(self) -> Bundles:
+        """What failures have left. Raises DoraSystemdError (NO_PERMISSION)."""
+        found = [one for one in self.known() if one.event != REQUESTED]
+        refused = self._refused()
+        if not found:
+            return refused
+        newest = found[-1]
+        return refused._replace(kept=len(found), newest=str(newest.path), newest_at=newest.at_us)
+
+    def _refused(self) -> Bundles:
+        with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
+            data = (self.path / _REFUSED).read_bytes()[:_MOST_TEXT]
+            found = as_mapping(json.loads(data))
+            return Bundles(0, "", 0, int(found["count"]), int(found["at_us"]), str(found["reason"]))
+        return Bundles()
+
+    def add_refused(self, reason: str, at_us: int) -> None:
+        """Count a bundle that was not written; call it with the lock. Raises OSError."""
+        facts = {"count": self._refused().refused + 1, "at_us": at_us, "reason": reason}
+        place = self.path / f"{_REFUSED}{PARTIAL}"
+        place.write_text(json.dumps(facts))
+        place.replace(self.path / _REFUSED)
+
     def new_path(self, stamp: str, event: str) -> Path:
-        """A path that no bundle has. stamp: of the time."""
-        taken = {one.stamp for one in self.known()}
-        stamps = (stamp, *(f"{stamp}.{number}" for number in range(1, 1000)))
-        free = next(one for one in stamps if one not in taken)
-        return self.path / f"{self.name}-{free}-{event}{_ENDING}"
+        """A path behind all of the same second. stamp: of the time."""
+        same = [one.place[1] for one in self.known() if one.place[0] == stamp]
+        number = f".{max(same) + 1}" if same else ""
+        return self.path / f"{self.name}-{stamp}{number}-{event}{_ENDING}"
 
     def make(self) -> None:
         """Create the directory. Raises DoraSystemdError."""
@@ -96,8 +139,10 @@ class BundleStore:
                 message = f"{self.name} has no bundle {shown(name)}"
                 raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
         self.drop(names)
-        with suppress(OSError):  # there are more
-            self.path.rmdir()
+        if known == {*names}:
+            (self.path / _REFUSED).unlink(missing_ok=True)
+            with suppress(OSError):  # there is another file
+                self.path.rmdir()
 
     def drop(self, names: list[str]) -> None:
         """Remove these bundles, which are known; the directory stays."""

@@ -22,7 +22,7 @@ from dora_systemd.decisions.views.formats import (
     zoned_time,
 )
 from dora_systemd.decisions.views.inhibitors import format_holders
-from dora_systemd.decisions.views.rows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow, format_bundles
 from dora_systemd.terminal_text import cut, one_line
 
 _WITH_REASON = (FAILED, DEGRADED, RESTARTING)
@@ -55,6 +55,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("Stopped", format_stopped({one.node: one.stopped_by for one in row.nodes})),
         ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),
         ("Inhibit", format_holders(row.inhibitors) if row.inhibitors else ""),
+        ("Bundle", format_bundles(row.bundles)),
         ("At boot", "started" if row.enabled else ""),
         ("Reason", f"doractl why {row.name}" if row.status in _WITH_REASON else ""),
     )

@@ -88,6 +88,8 @@ SUPPRESSED = Family(
     "log_lines_suppressed_total", "Lines that log_rate_limit kept out of the journal."
 )
 LOST = Family("log_lines_lost_total", "Lines of its nodes that are not in the journal.")
+BUNDLES = Family("bundles", "Bundles of its failures that are kept.")
+REFUSED = Family("bundles_refused_total", "Failures without a bundle: see bundle-refused.")
 BUILD = Family("dora_systemd_build_info", "Version of dora-systemd; always 1.")
 
 
@@ -112,6 +114,9 @@ def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, li
     yield NODES, [(own, one.row.nodes_total) for own, one in labelled if one.usage]
     yield ALIVE, [(own, one.row.nodes_alive) for own, one in labelled if one.usage]
     yield LOST, [(own, o.lines[WHOLE_CELL].lost) for own, o in labelled if WHOLE_CELL in o.lines]
+    boxes = [(own, one.row.bundles) for own, one in labelled if one.row.bundles]
+    yield BUNDLES, [(own, box.kept) for own, box in boxes]
+    yield REFUSED, [(own, box.refused) for own, box in boxes]
     yield from _group_samples([(own, one, WHOLE_CELL) for own, one in labelled])
 
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 from dora_systemd import __version__
 from dora_systemd.decisions.views.facts import USAGE, Fact, NodeRow
 from dora_systemd.names import release_of
+from dora_systemd.values import SECOND
 
 
 class Holder(NamedTuple):
@@ -20,6 +21,38 @@ class Holder(NamedTuple):
     def values(self) -> dict[str, Any]:
         """The holder for JSON."""
         return {key: value or None for key, value in self._asdict().items()}
+
+
+class Bundles(NamedTuple):
+    """The bundles that failures of a dataflow have left, and those that were not written."""
+
+    kept: int = 0
+    newest: str = ""  # its path
+    newest_at: int = 0  # CLOCK_REALTIME µs
+    refused: int = 0
+    refused_at: int = 0  # the last one that was not written, CLOCK_REALTIME µs
+    reason: str = ""  # why that one was not written
+
+    def values(self) -> dict[str, Any]:
+        """The bundles for JSON."""
+        return {
+            "kept": self.kept,
+            "newest": self.newest or None,
+            "refused": self.refused,
+            "reason": self.reason or None,
+        }
+
+
+def format_bundles(bundles: Bundles | None, since_us: int = 0) -> str:
+    """Format "/var/lib/.../robot-...-failed.tar and 2 more; 1 not written, the last: ...".
+
+    since_us: "" if all is older. The time of a bundle is a whole second.
+    """
+    if bundles is None or max(bundles.newest_at + SECOND, bundles.refused_at) < since_us:
+        return ""
+    more = f" and {bundles.kept - 1} more" if bundles.kept > 1 else ""
+    lost = f"{bundles.refused} not written, the last: {bundles.reason}" if bundles.refused else ""
+    return "; ".join(filter(None, (f"{bundles.newest}{more}", lost)))
 
 
 class DataflowRow(NamedTuple):
@@ -60,6 +93,7 @@ class DataflowRow(NamedTuple):
     runner_version: str = ""  # of dora-systemd when it was started, "" if that is not known
     options_problem: str = ""  # why this doractl does not know all its options, or ""
     is_up: bool = True  # whether systemd has begun its start, or has the start in its queue
+    bundles: Bundles | None = None  # of its failures; None if there are none to be read
 
     @property
     def release(self) -> str:
@@ -109,4 +143,5 @@ DATAFLOW_FACTS = (
     Fact("machines", value=list),
     Fact("runner_version"),
     Fact("options_problem"),
+    Fact("bundles", value=lambda found: found.values() if found else None),
 )

@@ -14,7 +14,7 @@ from dora_systemd.decisions.views.dataflows import RESTARTING, colored_state
 from dora_systemd.decisions.views.formats import UNKNOWN, local_time, zoned_time
 from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.decisions.views.objects import dataflow_object, moment, switch_object
-from dora_systemd.decisions.views.rows import DataflowRow, Holder
+from dora_systemd.decisions.views.rows import Bundles, DataflowRow, Holder, format_bundles
 from dora_systemd.decisions.why.last_lines import Word, shown_last
 from dora_systemd.decisions.why.lives import parse_number
 from dora_systemd.decisions.why.remedies import (
@@ -85,6 +85,7 @@ class Report:
     keeps_core_dumps: bool = True  # whether this machine does
     waits: tuple[CpuWait, ...] = ()  # of nodes that run, for a CPU
     outside: str = ""  # the containers outside of the cgroups of the nodes
+    bundles: Bundles | None = None  # of failures of the dataflow
 
     @property
     def node(self) -> str:
@@ -215,6 +216,7 @@ def _facts(report: Report) -> list[str]:
         "Budget": _budget_words(report),
         "Inhibit": format_holders(report.inhibitors) if report.inhibitors else "",
         "Before": f"{verdict.before} ({zoned_time(verdict.before_us)})" if verdict.before else "",
+        "Bundle": format_bundles(report.bundles, verdict.before_us or verdict.began_us),
         "Unit": f"{subject.unit} ({subject.uuid})",
         "File": subject.file,
         "Release": release_of(subject.file),

@@ -13,7 +13,15 @@ from typing import NamedTuple
 from dora_systemd import __version__
 from dora_systemd.adapters.bundles.archive import Archive, Section, Sink
 from dora_systemd.adapters.bundles.reader import opened
-from dora_systemd.adapters.bundles.store import LEAST, REQUESTED, BundleStore, Stored, locked, room
+from dora_systemd.adapters.bundles.store import (
+    LEAST,
+    REQUESTED,
+    STAMP,
+    BundleStore,
+    Stored,
+    locked,
+    room,
+)
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request, requester
 from dora_systemd.adapters.journal.reader import JournalReader
@@ -40,7 +48,6 @@ from dora_systemd.verbs.why import explain, subject_row
 MOST_BYTES = 256 * 1024 * 1024
 """Maximum bytes of a bundle that is requested."""
 BY = "doranotice"
-_STAMP = "%Y%m%dT%H%M%SZ"
 
 
 def _now_us() -> int:
@@ -93,7 +100,7 @@ def write_bundle(
         store = BundleStore(scope.state_root, subject.name)
         with locked(store), _explained(store.path):
             store.remove_partial()
-            path = store.new_path(time.strftime(_STAMP, time.gmtime()), REQUESTED)
+            path = store.new_path(time.strftime(STAMP, time.gmtime()), REQUESTED)
             written = _write(path, min(MOST_BYTES, room(store.path)), what, manifest)
     details = {"scope": scope.word, "file": str(written.path)}
     note_request(BUNDLE_WRITTEN, subject.name, subject.uuid, command, **details)
@@ -140,6 +147,10 @@ def write_after(
         path, problem = _written_after(reach, scope, cell, box, failure, now_us()), ""
     except DoraSystemdError as error:
         path, problem = "", error.message
+        store = BundleStore(scope.state_root, cell.name)
+        # The event has the reason as well: the disk may be full.
+        with suppress(OSError, DoraSystemdError), locked(store):
+            store.add_refused(problem, now_us())
     details = {"scope": scope.word, **failure.details}
     details |= {"reason": problem} if problem else {"file": path}
     event = BUNDLE_REFUSED if problem else BUNDLE_WRITTEN
@@ -168,7 +179,7 @@ def _written_after(
             raise DoraSystemdError(message, "doractl bundle writes one now")
         store.drop(to_remove(past, box.keep))
         most = min(box.most, room(store.path))
-        path = store.new_path(time.strftime(_STAMP, time.gmtime()), failure.event)
+        path = store.new_path(time.strftime(STAMP, time.gmtime()), failure.event)
         return str(_write(path, most, what, manifest).path)
 
 

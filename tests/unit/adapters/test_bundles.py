@@ -15,6 +15,7 @@ from dora_systemd.adapters.bundles.archive import BLOCK, Archive, Section, Sink
 from dora_systemd.adapters.bundles.reader import opened
 from dora_systemd.adapters.bundles.store import BundleStore, locked, room
 from dora_systemd.decisions.bundles.manifest import MANIFEST, Manifest, format_manifest
+from dora_systemd.decisions.views.rows import Bundles, format_bundles
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 AT = 1_767_225_600_000_000
@@ -193,6 +194,24 @@ def test_the_store(store: BundleStore) -> None:
     store.remove(names)
     assert store.known() == []
     assert [path.name for path in store.path.iterdir()] == ["notes.txt"]
+
+
+def test_what_failures_have_left(store: BundleStore) -> None:
+    assert store.of_failures() == Bundles()
+    with locked(store):
+        for event in ("failed", "node-given-up", "requested"):
+            write(store.new_path("20260101T000000Z", event))
+        store.add_refused("too soon", AT)
+        store.add_refused("it is full", AT + 5)
+        store.remove_partial()
+    newest = store.path / "robot-20260101T000000Z.1-node-given-up.tar"
+    found = Bundles(2, str(newest), AT, 2, AT + 5, "it is full")
+    assert store.of_failures() == found
+    assert format_bundles(found) == f"{newest} and 1 more; 2 not written, the last: it is full"
+    (store.path / ".refused").write_text("[5")
+    assert store.of_failures() == Bundles(2, str(newest), AT)
+    store.remove([one.id for one in store.known()])
+    assert not store.path.exists()
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from dora_systemd.decisions.resources.containers import Container
 from dora_systemd.decisions.resources.usage import LineCount, Strain, Usage
 from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.prometheus import STATES, format_metrics
-from dora_systemd.decisions.views.rows import DataflowRow
+from dora_systemd.decisions.views.rows import Bundles, DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.values import INFINITY
 
@@ -111,6 +111,14 @@ def test_numbers_of_nodes() -> None:
     assert "dora_node_memory_limit_bytes" not in found
     assert "dora_node_memory_peak_bytes" not in found
     assert len(found["dora_node_ready_time_seconds"].samples) == 1
+
+
+def test_bundles_of_failures() -> None:
+    bundles = Bundles(2, "/x/robot.tar", 5, refused=3)
+    found = families(replace(ROBOT, row=ROBOT.row._replace(bundles=bundles)), FAILED)
+    assert value(found, "dora_dataflow_bundles", dataflow="robot") == 2
+    assert value(found, "dora_dataflow_bundles_refused_total", dataflow="robot") == 3
+    assert len(found["dora_dataflow_bundles"].samples) == 1
 
 
 def test_signs_of_life() -> None:

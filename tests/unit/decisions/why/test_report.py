@@ -11,7 +11,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.logs.journal_events import ROLLED_BACK as BACK_EVENT
 from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, Switch
 from dora_systemd.decisions.resources.rivals import Rival
-from dora_systemd.decisions.views.rows import DataflowRow, Holder
+from dora_systemd.decisions.views.rows import Bundles, DataflowRow, Holder
 from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import Happening
 from dora_systemd.decisions.why.report import (
@@ -246,6 +246,25 @@ def test_the_last_release_that_was_undone(
     """The history says more about a way back than the event."""
     found = facts(replace(VERDICT, timeline=timeline), undone=undone)
     assert found.get("Undone") == words
+
+
+@pytest.mark.parametrize(
+    ("bundles", "words"),
+    [
+        (None, None),
+        (Bundles(1, "/x.tar", BEGAN - SECOND // 2), "/x.tar"),
+        (Bundles(1, "/x.tar", BEGAN - 2 * SECOND), None),
+        (Bundles(3, "/x.tar", CRASHED), "/x.tar and 2 more"),
+        (Bundles(0, "", 0, 1, CRASHED, "it is full"), "1 not written, the last: it is full"),
+        (
+            Bundles(1, "/x.tar", 5, 2, CRASHED, "too soon"),
+            "/x.tar; 2 not written, the last: too soon",
+        ),
+    ],
+)
+def test_the_bundle_that_a_failure_has_left(bundles: Bundles | None, words: str | None) -> None:
+    verdict = replace(VERDICT, before="", before_us=0)
+    assert facts(verdict, bundles=bundles).get("Bundle") == words
 
 
 def news(count: int) -> list[str]:

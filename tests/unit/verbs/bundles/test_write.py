@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.bundles.reader import opened
+from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.black_box import BlackBox
+from dora_systemd.decisions.views.details import format_dataflow
+from dora_systemd.decisions.why.report import format_report
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.bundles.listing import (
@@ -21,6 +24,8 @@ from dora_systemd.verbs.bundles.listing import (
 )
 from dora_systemd.verbs.bundles.write import Failure, write_after, write_bundle
 from dora_systemd.verbs.facts.cells import read_cell
+from dora_systemd.verbs.list import find_row
+from dora_systemd.verbs.why import explain
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
@@ -116,6 +121,13 @@ def test_bundles_of_failures_are_bounded(
     assert [bool(one) for one in paths] == [True, False, True, True]
     left = {row.id for row in read_bundles(scope, ["robot"])}
     assert left == {requested.name, *(Path(one).name for one in paths[2:])}
+    row = find_row(manager, scope, "robot")
+    assert row.bundles
+    assert (row.bundles.kept, row.bundles.newest, row.bundles.refused) == (2, paths[-1], 1)
+    shown = format_dataflow(row)
+    assert f"Bundle:   {paths[-1]} and 1 more; 1 not written, the last: one about " in shown
+    why = format_report(explain(manager, scope, "robot", JournalReader()))
+    assert f"Bundle:   {paths[-1]} and 1 more" in why
 
 
 def test_a_bundle_that_cannot_be_written_is_an_event(
