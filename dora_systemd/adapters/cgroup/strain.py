@@ -34,13 +34,19 @@ def read_load(path: Path) -> Load:
     """Read how much memory a group holds, and how close it is to its limit.
 
     The caller adds what concerns its CPU. Only memory counts that the kernel cannot drop: caches of
-    files fill every group up.
+    files fill every group up. Files that processes have mapped are in addition: without these
+    pages programs read them again and again.
     """
     stat = read_numbers(path / "memory.stat")
     held = stat.get("anon", 0) + stat.get("shmem", 0)
     limits = [read_number(path / name) for name in ("memory.max", "memory.high")]
     limit = min((one for one in limits if one is not None), default=INFINITY)
-    return Load(held) if limit == INFINITY else Load(held, limit, _read_stalled(path))
+    # Pages of shmem count as mapped, and as those of files, too.
+    files = stat.get("file", 0) - stat.get("shmem", 0)
+    mapped = max(min(stat.get("file_mapped", 0), files), 0)
+    if limit == INFINITY:
+        return Load(held, mapped=mapped)
+    return Load(held, limit, _read_stalled(path), mapped=mapped)
 
 
 def read_waited(path: Path) -> float | None:

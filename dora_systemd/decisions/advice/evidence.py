@@ -23,6 +23,7 @@ EVENTS = (
 
 # Kinds, and their units. A limit is the one that was reached.
 HELD, MEMORY_LIMIT = "held", "memory limit"  # bytes
+MAPPED = "mapped"  # bytes, with files that processes have mapped
 USED, CPU_LIMIT = "used", "cpu limit"  # µs of CPU time per second
 RESTART, CRASH = "restart", "crash"  # µs since the process of the node became ready
 STOP, CUT_STOP = "stop", "cut stop"  # µs since the stop request; of a stop that was cut short
@@ -96,6 +97,8 @@ def _used(one: Happening) -> _Found:
     if one.name in (*END_EVENTS, *NODE_END_EVENTS):
         if held := _number(one, "held_peak"):
             yield one.node, HELD, held, one.at_us
+        if mapped := _number(one, "mapped_peak"):
+            yield one.node, MAPPED, mapped, one.at_us
         if used := _number(one, "cpu_peak"):
             yield one.node, USED, used * _PERCENT, one.at_us
     if one.name == MEMORY and (held := _number(one, "held")):

@@ -13,6 +13,7 @@ from dora_systemd.decisions.advice.evidence import (
     CRASH,
     CUT_STOP,
     HELD,
+    MAPPED,
     MEMORY_LIMIT,
     RESTART,
     SILENCE,
@@ -128,7 +129,10 @@ def _memory(node: str, found: Evidence, current: Current) -> Iterator[Advice]:
     seen = limit if is_least else top
     if seen is None or (not node and not is_least and now == INFINITY):
         return  # a limit for all nodes is for those who share a machine, not for every robot
-    value = _size(seen.value * (_STEP if is_least else _MORE))
+    # What is mapped fills any limit up, so it raises an advice, and is no reason for one.
+    mapped = most(found.get((node, MAPPED), ()))
+    least = mapped.value * _ENOUGH if mapped else 0
+    value = _size(max(seen.value * (_STEP if is_least else _MORE), least))
     is_enough = now >= seen.value * (_STEP if is_least else _ENOUGH)
     is_too_much = now > _TOO_MUCH * value and bool(node)
     if (is_enough and not is_too_much) or value > current.machine_memory:
@@ -138,6 +142,7 @@ def _memory(node: str, found: Evidence, current: Current) -> Iterator[Advice]:
         why = f"reached its limit of {size} {_times(reached)}"
     else:
         why = f"held at most {format_rounded_size(seen.value)}"
+        why += f", {format_rounded_size(mapped.value)} with mapped files" if mapped else ""
     before = "" if now == INFINITY else format_rounded_size(now)
     many = tuple(reached if is_least else held)
     yield Advice(node, ("memory_limit",), before, format_size(value), is_least, why, many)

@@ -53,6 +53,7 @@ _OWN = {
     *("FORMER", "HELD", "HOW", "LEVEL", "LIMIT", "MACHINE", "MOST", "OUTPUT", "OWNER", "PAUSE"),
     *("PEAK", "REASON", "RELEASE", "SCOPE", "SENDER", "STATUS", "TARGET", "THEN", "TIMESTAMP"),
     *("UNTIL", "FIELDS_MORE", "HELD_PEAK", "CPU_PEAK", "CPU_LIMIT", "PROGRAM", "CONTAINER"),
+    "MAPPED_PEAK",
 }
 """Fields that begin with DORA_: DORA_SETTINGS, which has all options of a start, is not here."""
 _OF_NODES = "DORA_FIELD_"

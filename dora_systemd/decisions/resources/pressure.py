@@ -39,6 +39,7 @@ class Load:
     # percent of one processor: used since the last sample, and the limit, or None
     cpu: float = 0.0
     cpu_limit: float | None = None
+    mapped: int = 0  # bytes of files that processes have mapped
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,12 @@ class Most:
 
     held: int = 0
     cpu: float = 0.0
+    used: int = 0  # held and mapped together
 
     def after(self, load: Load) -> "Most":
         """Return it after one more sample."""
-        return Most(max(self.held, load.held), max(self.cpu, load.cpu))
+        used = max(self.used, load.held + load.mapped)
+        return Most(max(self.held, load.held), max(self.cpu, load.cpu), used)
 
     def details(self) -> dict[str, str]:
         """Details of the event with which a node or a dataflow ends; what is not known is left out.
@@ -59,6 +62,7 @@ class Most:
         """
         known = {
             "held_peak": str(self.held or ""),
+            "mapped_peak": str(self.used if self.used > self.held else ""),
             "cpu_peak": f"{self.cpu:.0f}" if self.cpu else "",
         }
         return {key: text for key, text in known.items() if text}

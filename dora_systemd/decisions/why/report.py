@@ -327,6 +327,7 @@ _NUMBERS = {
     "limit": "memory_limit_bytes",
     "held": "memory_bytes",
     "held_peak": "memory_held_peak_bytes",
+    "mapped_peak": "memory_mapped_peak_bytes",
     "cpu_peak": "cpu_peak_percent",
     "node_pid": "pid",
     "exit_status": "exit_status",

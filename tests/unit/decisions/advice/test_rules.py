@@ -192,6 +192,24 @@ def test_memory_has_its_evidence() -> None:
     assert advise(recorded(kills), node(memory={"camera": 150 * MIB})) == [], "it has been raised"
 
 
+@pytest.mark.parametrize(
+    ("mapped", "now", "value"),
+    [(110, INFINITY, "122M"), (300, INFINITY, "336M"), (300, 105, "336M"), (300, 600, None)],
+)
+def test_an_advice_is_not_below_what_is_mapped(mapped: int, now: int, value: str | None) -> None:
+    ended = event("node-exited", moment(0, 5), mapped_peak=mapped * MIB)
+    memory = {"camera": now * MIB if now < INFINITY else INFINITY}
+    found = advise(recorded([ended]), node(memory=memory))
+    assert [one.value for one in found] == ([value] if value else [])
+    for one in found:
+        assert one.why == f"held at most 100M, {mapped}M with mapped files"
+
+
+def test_mapped_files_fill_a_limit_and_need_no_more() -> None:
+    ended = event("node-exited", moment(0, 5), mapped_peak=150 * MIB)
+    assert advise(recorded([ended]), node(memory={"camera": 150 * MIB})) == []
+
+
 @pytest.mark.parametrize("owner", ["machine", "dataflow"])
 def test_another_limit_hides_nothing(owner: str) -> None:
     kill = event("node-oom", moment(0, 5), owner=owner, limit=100 * MIB)

@@ -443,7 +443,10 @@ def test_how_a_stopped_node_ended() -> None:
 
 BY_HAND = "run: doractl restart {name}"
 AUTOMATIC = f"{BY_HAND}; --restart-policy on-failure does this automatically"
-MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)"
+SIZE = "; doractl advise {name} proposes sizes by what was held before"
+MORE_MEMORY = (
+    f"doractl set {{name}} --memory-limit SIZE, or limit single nodes (--node-limit){SIZE}"
+)
 
 
 @pytest.mark.parametrize(
@@ -457,11 +460,13 @@ MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (--
         (Verdict("Failed", Cause.NODE_OUT_OF_MEMORY, details={"owner": "dataflow"}), MORE_MEMORY),
         (
             Verdict("Failed", Cause.NODE_OUT_OF_MEMORY, details={"owner": "machine"}),
-            "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
+            "the machine is short of memory: limit single nodes "
+            f"(--node-limit NODE:memory=SIZE){SIZE}",
         ),
         (
             Verdict("Failed", Cause.NODE_OUT_OF_MEMORY, details={"owner": "node"}),
-            "find the leak in {node}, or run: doractl set {name} --node-limit {node}:memory=SIZE",
+            "find the leak in {node}, or run: "
+            f"doractl set {{name}} --node-limit {{node}}:memory=SIZE{SIZE}",
         ),
         (
             Verdict("Failed", Cause.NODE_FAILED, details={"exit": "signal SIGKILL"}),

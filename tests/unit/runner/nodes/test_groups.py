@@ -71,11 +71,14 @@ def test_the_most_that_a_group_has_used(unit: Path) -> None:
     (unit / "node-a/memory.max").write_text("max\n")
     samples: tuple[CpuSample, ...] = ()
     for number, (held, cpu) in enumerate(((20, 0), (50, 4_000_000), (30, 5_000_000))):
-        stat.write_text(f"anon {held * MIB}\nfile 99999999\nshmem {2 * MIB}\n")
+        files = f"file {held * MIB // 2}\nfile_mapped {30 * MIB}\n"
+        stat.write_text(f"anon {held * MIB}\n{files}shmem {2 * MIB}\n")
         now = CpuSample(number * 5_000_000, {"a": cpu})
         assert [one.node for one in resources.look(samples, now)] == []
         samples = (now,)
-    assert resources.most("a") == {"held_peak": str(52 * MIB), "cpu_peak": "80"}
+    # Of what is mapped, at most what the group has of files counts, without shared memory.
+    most = {"held_peak": str(52 * MIB), "mapped_peak": str(75 * MIB), "cpu_peak": "80"}
+    assert resources.most("a") == most
     assert resources.most("b") == {}, "no memory.stat, and no CPU time"
 
 
