@@ -36,6 +36,7 @@ def they_are_back() -> None:
 
 def test_they_are_back() -> None:
     they_are_back()
+    assert json.loads(doractl("bundles", "begun", "-o", "json")) == [], "it was shut down"
 
 
 def test_the_boot_waits_for_none_of_them() -> None:

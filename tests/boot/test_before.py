@@ -37,7 +37,7 @@ def test_enable() -> None:
     packages.install()
     packages.make_venv(VENV)
     begun = flow(Path("/srv/begun"))
-    start(begun, "--enable", "--no-wait", "--env", "A=x $B %h")
+    start(begun, "--enable", "--no-wait", "--env", "A=x $B %h", "--black-box", "yes")
     start(flow(Path("/srv/running")))
     doractl("enable", "running")
     gone = flow(Path("/srv/gone"))

@@ -12,6 +12,8 @@ _MOST_KEPT = 100
 _LEAST_EACH = 1024 * 1024
 QUIET = 600 * SECOND
 """After a bundle the next one of the same node and cause is written no earlier."""
+AFTER_BOOT = 600 * SECOND
+"""Until then after a boot a bundle of what ran before a power cut is written: CLOCK_BOOTTIME."""
 _HINT = "write {keep: 5, size: 100M}, yes or no"
 
 
@@ -25,6 +27,11 @@ class BlackBox(NamedTuple):
     def most(self) -> int:
         """Maximum bytes of one: all of them together are never larger than `size`."""
         return self.size // self.keep
+
+
+def is_after_boot(box: BlackBox | None, now_us: int) -> bool:
+    """Whether a bundle of what ran before a power cut may be written. now_us: CLOCK_BOOTTIME."""
+    return box is not None and now_us < AFTER_BOOT
 
 
 class Past(NamedTuple):

@@ -175,6 +175,7 @@ EVENTS = {
     ),
 }
 
+STARTING, STARTED, STOPPING = "dataflow-starting", "dataflow-started", "dataflow-stopping"
 # Each life of a dataflow ends with one of these, unless the runner was killed.
 END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
 # Each life of a node's process ends with one of these.

@@ -9,11 +9,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dora_systemd.decisions.logs.journal_events import (
+    BUNDLE_WRITTEN,
+    END_EVENTS,
     EVENTS,
     GIVEN_UP,
     NOTICE_ENDS,
     REQUESTS,
     ROLLED_BACK,
+    STARTED,
+    STARTING,
+    STOPPING,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, unit_name
@@ -212,6 +217,13 @@ def notice_matches(scope: Scope, name: str) -> list[str]:
 def sent_matches(scope: Scope, name: str) -> list[str]:
     """Matches for the notices and bundles that were written, which nodes cannot write."""
     return [*_asked_matches(scope, *NOTICE_ENDS), f"DORA_DATAFLOW_NAME={name}"]
+
+
+def cut_matches(scope: Scope, name: str) -> list[str]:
+    """Matches for the beginnings and ends of lives, and for bundles."""
+    events = [f"DORA_EVENT={one}" for one in (STARTING, STARTED, STOPPING, *END_EVENTS)]
+    bundles = [*_asked_matches(scope, BUNDLE_WRITTEN), f"DORA_DATAFLOW_NAME={name}"]
+    return [*scope_matches(scope, name), *events, "+", *end_matches(scope, name), "+", *bundles]
 
 
 def request_matches(scope: Scope, *events: str) -> list[str]:

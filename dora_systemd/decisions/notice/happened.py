@@ -9,8 +9,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.logs.journal_events import NOTICE_ENDS, ROLLED_BACK
-from dora_systemd.decisions.logs.query import UNIT_FAILED
+from dora_systemd.decisions.logs.journal_events import (
+    BUNDLE_WRITTEN,
+    END_EVENTS,
+    NOTICE_ENDS,
+    ROLLED_BACK,
+    STOPPING,
+)
+from dora_systemd.decisions.logs.query import UNIT_ENDS, UNIT_FAILED
 from dora_systemd.names import is_node_id, is_readable
 from dora_systemd.values import SECOND, format_duration, format_moment
 
@@ -22,6 +28,9 @@ _WORDS = {
 }
 ORDER = (FAILED, *_WORDS.values())
 """The values of DORA_NOTICE_EVENT, the worst first."""
+
+POWER_LOST = "power-lost"
+"""The event of a bundle about what ran when the machine went down without a shutdown."""
 
 FIRST_PAUSE = 15 * SECOND
 """Between the first notice and the next one: no minute has more than five."""
@@ -96,6 +105,21 @@ def read_story(
         elif one := _happened(record, event, mono_us):
             found.append(one)
     return [_with_cause(one, causes) for one in found], last
+
+
+def has_lost_power(records: Iterable[Mapping[str, Any]], boot: str) -> bool:
+    """Whether a dataflow ran when the machine went down, and no bundle is about that yet.
+
+    records: as of cut_matches(), newest first. boot: the id of this boot.
+    """
+    for record in islice(records, MOST_ENDS):
+        event = record.get("DORA_EVENT", "")
+        if record.get("_BOOT_ID") != boot:
+            is_end = event in (*END_EVENTS, STOPPING) or record.get("MESSAGE_ID") in UNIT_ENDS
+            return not (is_end or event in NOTICE_ENDS)
+        if event == BUNDLE_WRITTEN and f"-{POWER_LOST}." in str(record.get("DORA_FILE")):
+            return False
+    return False
 
 
 def _sent(record: Mapping[str, Any], mono_us: int) -> Sent:

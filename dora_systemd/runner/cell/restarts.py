@@ -62,11 +62,23 @@ def report_last_life(options: RunnerOptions, environment: Mapping[str, str]) -> 
 
     systemd 254 starts the units of OnFailure= at each failure, and sets $FDSTORE; earlier versions
     start them only if no restart follows. The earlier life has left descriptors, see fd_store.
+
+    After a boot the last life may have ended with the power: for the service to find out.
     """
-    file = request_file(environment) if options.is_noticed else None
-    if file and "FDSTORE" not in environment and environment.get("LISTEN_FDNAMES"):
+    if (file := request_file(environment) if options.is_noticed else None) is None:
+        return
+    has_left = environment.get("LISTEN_FDNAMES")
+    if (has_left and "FDSTORE" not in environment) or (not has_left and _is_after_boot(options)):
         with contextlib.suppress(OSError):
             file.touch(0o600)
+
+
+def _is_after_boot(options: RunnerOptions) -> bool:
+    if not options.has("black_box"):
+        return False
+    from dora_systemd.decisions.cell.black_box import is_after_boot
+
+    return is_after_boot(options.of_dataflow("black_box"), _now_us())
 
 
 def find_spent(options: RunnerOptions, paths: CellPaths) -> RestartsSpent | None:

@@ -57,6 +57,7 @@ class Evidence:
     want_journal: bool
     examine: Callable[[], Iterable[Finding]]  # doctor's
     want_pictures: bool = False
+    has_lost_power: bool = False  # the life that it is about has ended with the power
     # what is not in the bundle, and why; a section may add to it while it is written
     left_out: list[str] = field(default_factory=list)
 
@@ -91,6 +92,9 @@ def _recording(what: Evidence) -> list[Section]:
     """The sections of the recorder, with the last messages of outputs."""
     if not what.want_journal:
         what.left_out.append(f"{recording.RECORDING}: --no-journal")
+        return []
+    if what.has_lost_power:
+        what.left_out.append(f"{recording.RECORDING}: power was lost")
         return []
     ring = recording.find(what.manager, what.scope, what.cell, what.report.subject.uuid)
     return recording.sections(ring, what.left_out, what.want_pictures)

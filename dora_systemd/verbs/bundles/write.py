@@ -36,6 +36,7 @@ from dora_systemd.decisions.bundles.manifest import (
 from dora_systemd.decisions.bundles.readme import format_readme
 from dora_systemd.decisions.cell.black_box import BlackBox, Past, is_too_soon, to_remove
 from dora_systemd.decisions.logs.journal_events import BUNDLE_REFUSED, BUNDLE_WRITTEN
+from dora_systemd.decisions.notice.happened import POWER_LOST
 from dora_systemd.decisions.why.report import format_report
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -113,6 +114,7 @@ def _evidence(
     selector: str,
     want_journal: bool,
     want_pictures: bool = False,
+    has_lost_power: bool = False,
 ) -> Evidence:
     """Find the dataflow, and what is known of it. Raises DoraSystemdError."""
     manager = reach(scope)
@@ -121,13 +123,14 @@ def _evidence(
     cell = read_cell(manager, subject.unit) if subject.is_loaded else None
     row = subject_row(manager, scope, subject)
     found = partial(examine, reach, scope)
-    return Evidence(manager, scope, report, row, cell, want_journal, found, want_pictures)
+    more = want_pictures, has_lost_power
+    return Evidence(manager, scope, report, row, cell, want_journal, found, *more)
 
 
 class Failure(NamedTuple):
     """What a bundle is about that nobody has requested, for its event."""
 
-    event: str  # one of ORDER of decisions/notice/happened.py
+    event: str  # one of ORDER of decisions/notice/happened.py, or POWER_LOST
     details: dict[str, str]
 
 
@@ -167,7 +170,8 @@ def _written_after(
     now_us: int,
 ) -> str:
     """Write the bundle; return its path. Raises DoraSystemdError."""
-    what = _evidence(reach, scope, cell.uuid, want_journal=True)
+    is_cut = failure.event == POWER_LOST
+    what = _evidence(reach, scope, cell.uuid, want_journal=True, has_lost_power=is_cut)
     manifest = replace(_manifest(what, BY), event=failure.event)
     store = BundleStore(scope.state_root, cell.name)
     with locked(store), _explained(store.path):

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ def main(arguments: Sequence[str]) -> int:
         manager, journal = Bus(scope), JournalReader()
         notify.send_ready()
         sender = Sender(manager, scope, name, journal, Path(place))
+        sender.write_after_boot(time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000)
         read = partial(read_journal, journal, scope, name)
         Dispatcher(manager, scope, name, read, sender.send).run()
     except DoraSystemdError as error:

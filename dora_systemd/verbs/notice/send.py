@@ -11,12 +11,16 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.host.files import write_atomic
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.cell.black_box import BlackBox
+from dora_systemd.decisions.cell.black_box import BlackBox, is_after_boot
 from dora_systemd.decisions.logs.journal_events import NOTICE_FAILED, NOTICE_SENT
+from dora_systemd.decisions.logs.query import cut_matches
 from dora_systemd.decisions.notice.command import unit_of, words_of
 from dora_systemd.decisions.notice.happened import (
+    MOST_ENDS,
+    POWER_LOST,
     Happened,
     format_environment,
+    has_lost_power,
     main_one,
     summary,
     variables,
@@ -34,6 +38,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import notice_command_unit, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.facts.lives import now_boot
 from dora_systemd.verbs.start.unit import systemd_number
 from dora_systemd.verbs.why import explain, subject_row
 
@@ -83,6 +88,18 @@ class Sender:
         details = {"until": str(happened[0].mono_us), "pause": str(pause_us)}
         failure = Failure(main_one(happened).what, details)
         write_after(self._reach, self._scope, cell, box, failure)
+
+    def write_after_boot(self, now_us: int) -> None:
+        """Write a bundle of the life that a power cut has ended. now_us: CLOCK_BOOTTIME."""
+        cell = read_cell(self._manager, unit_name(self._name))
+        box = cell.options.of_dataflow("black_box") if cell else None
+        if cell is None or box is None or not is_after_boot(box, now_us):
+            return
+        records = self._journal.newest(cut_matches(self._scope, self._name), MOST_ENDS)
+        if has_lost_power(records, now_boot()):
+            from dora_systemd.verbs.bundles.write import Failure, write_after
+
+            write_after(self._reach, self._scope, cell, box, Failure(POWER_LOST, {}))
 
     def _reach(self, scope: Scope) -> Manager:
         return self._manager if scope == self._scope else Bus(scope, for_reading=True)

@@ -171,6 +171,7 @@ LATE = {
         "runner.cell.restarts": {
             *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
             *("adapters.host.unit_files", "decisions.cell.status", "asyncio"),
+            "decisions.cell.black_box",
         },
     },
     "systemd runs it after every life, and it has nothing to do unless the runner was killed": {

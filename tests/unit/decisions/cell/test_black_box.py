@@ -3,10 +3,12 @@
 import pytest
 
 from dora_systemd.decisions.cell.black_box import (
+    AFTER_BOOT,
     QUIET,
     BlackBox,
     Past,
     format_black_box,
+    is_after_boot,
     is_too_soon,
     parse_black_box,
     to_remove,
@@ -50,6 +52,12 @@ def test_bad_values(text: str) -> None:
         parse_black_box(text)
     assert caught.value.code is ExitCode.USAGE
     assert caught.value.hint
+
+
+def test_a_power_cut_is_looked_for_after_a_boot() -> None:
+    assert is_after_boot(BlackBox(), AFTER_BOOT - 1)
+    assert not is_after_boot(BlackBox(), AFTER_BOOT)
+    assert not is_after_boot(None, 0)
 
 
 def past(*events: str) -> list[Past]:

@@ -17,6 +17,7 @@ from dora_systemd.decisions.notice.happened import (
     Happened,
     Sent,
     format_environment,
+    has_lost_power,
     main_one,
     next_pause,
     pause_left,
@@ -47,6 +48,34 @@ def failed(seconds: float, life: str, reason: str) -> dict[str, Any]:
 def sent(seconds: float, until: float, event: str = "notice-sent") -> dict[str, Any]:
     told = {"DORA_UNTIL": str(int(until * SECOND)), "DORA_PAUSE": str(30 * SECOND)}
     return record(seconds, DORA_EVENT=event, **told)
+
+
+NOW_STARTED = record(3, DORA_EVENT="dataflow-started")
+STARTED = {**record(900, DORA_EVENT="dataflow-started"), "_BOOT_ID": "a"}
+WRITTEN = record(5, DORA_EVENT="bundle-written", DORA_FILE="/x/robot-1-power-lost.tar")
+UNIT_ENDED = "7ad2d189f7e94e70a38c781354912448"
+
+
+@pytest.mark.parametrize(
+    ("newest", "is_lost"),
+    [
+        ([], True),
+        ([NOW_STARTED], True),
+        ([WRITTEN, NOW_STARTED], False),
+        ([record(5, DORA_EVENT="bundle-written", DORA_FILE="/x/robot-1-failed.tar")], True),
+        ([{**record(950, DORA_EVENT="dataflow-stopping"), "_BOOT_ID": "a"}], False),
+        ([{**record(950, DORA_EVENT="dataflow-failed"), "_BOOT_ID": "a"}], False),
+        ([{**record(950, MESSAGE_ID=UNIT_ENDED), "_BOOT_ID": "a"}], False),
+        ([{**record(950, DORA_EVENT="dataflow-starting"), "_BOOT_ID": "a"}], True),
+    ],
+)
+def test_what_ran_when_the_power_failed(newest: list[dict[str, Any]], is_lost: bool) -> None:
+    assert has_lost_power([*newest, STARTED], "b") == is_lost
+
+
+def test_nothing_ran_before_this_boot() -> None:
+    assert not has_lost_power([NOW_STARTED], "b")
+    assert not has_lost_power([NOW_STARTED] * 1000 + [STARTED], "b")
 
 
 def test_each_failure_of_the_unit_counts_once_with_its_cause() -> None:

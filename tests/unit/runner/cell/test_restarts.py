@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.host import fd_store
+from dora_systemd.decisions.cell.black_box import AFTER_BOOT, parse_black_box
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import HEAD_START, RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
@@ -268,6 +269,23 @@ def test_an_old_systemd_sends_no_notice_of_a_life_that_is_restarted(
     runner = options().with_value("on_failure", words)
     report_last_life(runner, given)
     assert list(directory.iterdir()) == [directory / "request"] * is_requested
+
+
+@pytest.mark.parametrize(
+    ("box", "fdnames", "is_requested"),
+    [("yes", "", True), ("yes", "dora-life", False), ("no", "", False)],
+)
+def test_after_a_boot_the_service_looks_for_a_power_cut(
+    tmp_path: Path, box: str, fdnames: str, is_requested: bool
+) -> None:
+    directory = tmp_path / "dora-systemd-notice/robot"
+    directory.mkdir(parents=True)
+    given = {"RUNTIME_DIRECTORY": f"/run/x/robot:{directory}", "FDSTORE": "4096"}
+    given |= {"LISTEN_FDNAMES": fdnames} if fdnames else {}
+    runner = options().with_value("black_box", parse_black_box(box))
+    report_last_life(runner, given)
+    is_new = time.clock_gettime(time.CLOCK_BOOTTIME) * SECOND < AFTER_BOOT
+    assert list(directory.iterdir()) == [directory / "request"] * (is_requested and is_new)
 
 
 def test_the_store_does_not_fill(unit: Unit) -> None:

@@ -10,6 +10,7 @@ import pytest
 from dora_systemd.adapters.bundles.reader import opened
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.black_box import BlackBox
+from dora_systemd.decisions.notice.happened import POWER_LOST
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.why.report import format_report
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -128,6 +129,17 @@ def test_bundles_of_failures_are_bounded(
     assert f"Bundle:   {paths[-1]} and 1 more; 1 not written, the last: one about " in shown
     why = format_report(explain(manager, scope, "robot", JournalReader()))
     assert f"Bundle:   {paths[-1]} and 1 more" in why
+
+
+def test_after_a_power_cut_there_is_no_recording(
+    reach: Reach, scope: ScopeIn, manager: FakeManager
+) -> None:
+    cell = read_cell(manager, "dora-robot.service")
+    assert cell
+    path = write_after(reach, scope, cell, BlackBox(), Failure(POWER_LOST, {}))
+    with opened(Path(path)) as bundle:
+        assert bundle.manifest.event == "power-lost"
+        assert "recording.mcap: power was lost" in bundle.manifest.left_out
 
 
 def test_a_bundle_that_cannot_be_written_is_an_event(
