@@ -78,8 +78,30 @@ def format_cell(figure: Figure, name: str) -> str:
     """A contestant's median; with ours to it, if it is a rival."""
     if name not in figure.values:
         return "–"
-    value = f"{format_number(figure.median(name))} {figure.unit}".strip()
-    return value if name == OURS else f"{value} ({format_ratio(figure.ratios(name))})"
+    if name == OURS:
+        return format_median(figure, name)
+    moods, ratios = figure.moods(name), format_ratios(figure, name)
+    values = (format_median(figure, name, rounds) for rounds in moods)
+    counts = (f", {count}" if count else "" for count in format_counts(moods))
+    cells = zip(values, ratios, counts, strict=True)
+    return "; ".join(f"{value} ({ratio}{count})" for value, ratio, count in cells)
+
+
+def format_median(figure: Figure, name: str, rounds: Sequence[int] = ()) -> str:
+    """The median of some rounds, or of all, with its unit."""
+    return f"{format_number(figure.median(name, rounds))} {figure.unit}".strip()
+
+
+def format_counts(moods: Sequence[Sequence[int]]) -> list[str]:
+    """How many rounds each mood has, such as "2 of 7"; "" if there is one mood."""
+    total = sum(map(len, moods))
+    return [f"{len(one)} of {total}" if len(one) < total else "" for one in moods]
+
+
+def format_ratios(figure: Figure, rival: str) -> list[str]:
+    """Ours to a rival, for its quick rounds and its slow ones if there are both."""
+    ratios = figure.ratios(rival)
+    return [format_ratio([ratios[one] for one in rounds]) for rounds in figure.moods(rival)]
 
 
 def format_table(figures: Sequence[Figure]) -> str:
@@ -135,10 +157,12 @@ def format_short(records: dict[str, Record]) -> str:
     for name, what, rival in HIGHLIGHTS:
         figures = records[name].figures if name in records else ()
         for figure in (one for one in figures if one.what == what and rival in one.values):
-            ours, theirs = (
-                f"{format_number(figure.median(n))} {figure.unit}" for n in (OURS, rival)
-            )
-            ratio = format_ratio(figure.ratios(rival))
+            ours = format_median(figure, OURS)
+            moods = figure.moods(rival)
+            medians = (format_median(figure, rival, one) for one in moods)
+            pairs = zip(medians, format_counts(moods), strict=True)
+            theirs = "; ".join(f"{text} ({count})" if count else text for text, count in pairs)
+            ratio = "; ".join(format_ratios(figure, rival))
             lines.append(f"| {what} | {ours} | {rival}: {theirs} | {ratio} |")
     return "\n".join(lines)
 

@@ -8,6 +8,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +16,9 @@ T = TypeVar("T")
 
 OURS = "doractl"
 """The contestant that all others are compared with."""
+
+ZENOH_MS = 300
+"""The least difference of a round in which dora has waited for zenoh to one in which it has not."""
 
 OUT = Path("/out")
 """Where `LAB_OUT=DIR tests/lab/lab run` takes files out of the lab."""
@@ -33,14 +37,30 @@ class Figure:
     goal: str = ""
     at: int | None = None
 
-    def median(self, name: str = OURS) -> float:
-        """Of all rounds of a contestant."""
-        return statistics.median(self.values[name])
+    def median(self, name: str = OURS, rounds: Sequence[int] = ()) -> float:
+        """Of all rounds of a contestant, or of some of them."""
+        values = self.values[name]
+        return statistics.median(values[one] for one in rounds or range(len(values)))
 
     def ratios(self, rival: str) -> list[float]:
         """Ours to a rival's, round by round; infinite where that is nothing."""
         pairs = zip(self.values[OURS], self.values[rival], strict=True)
         return [ours / other if other else math.inf for ours, other in pairs]
+
+    def moods(self, name: str) -> list[list[int]]:
+        """The rounds of a contestant: the quick ones and the slow ones, or all of them.
+
+        Bare dora waits half a second for zenoh, or does not, by chance. Its median says which of
+        the two happened more often.
+        """
+        values = self.values[name]
+        order = sorted(range(len(values)), key=values.__getitem__)
+        steps = [(values[b] - values[a], values[b] > values[a] * 1.5) for a, b in pairwise(order)]
+        widest, is_wide = max(steps, default=(0.0, False))
+        if self.unit != "ms" or widest < ZENOH_MS or not is_wide:
+            return [order]
+        cut = steps.index((widest, is_wide)) + 1
+        return [order[:cut], order[cut:]]
 
     @property
     def rivals(self) -> list[str]:

@@ -92,6 +92,30 @@ def test_table() -> None:
     ]
 
 
+def test_the_two_times_of_dora_are_apart() -> None:
+    values = {"doractl": [400.0, 400.0, 420.0], "dora run": [680.0, 200.0, 700.0]}
+    moody = replace(FIGURE, values=values)
+    assert moody.moods("dora run") == [[1], [0, 2]]
+    assert moody.moods("doractl") == [[0, 1, 2]]
+    assert "| 200 ms (**2.00**, 1 of 3); 690 ms (**0.59**, 0.59–0.60, 2 of 3) |" in format_table(
+        [moody]
+    )
+    record = replace(RECORD, figures=(moody,))
+    assert format_short({"start": record}).splitlines()[2:] == [
+        "| start to all of 2 nodes ready | 400 ms | dora run: 200 ms (1 of 3); 690 ms (2 of 3) "
+        "| **2.00**; **0.59**, 0.59–0.60 |"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("unit", "values"),
+    [("1/s", [200.0, 700.0]), ("ms", [200.0, 490.0]), ("ms", [900.0, 1300.0]), ("ms", [700.0])],
+)
+def test_other_differences_are_the_spread(unit: str, values: list[float]) -> None:
+    figure = Figure("x", unit, {"doractl": values, "pm2": values})
+    assert len(figure.moods("pm2")) == 1
+
+
 def test_a_new_rival_begins_a_new_table() -> None:
     fewer = replace(FIGURE, values={"doractl": [1.0], "pm2": [1.0]})
     other = replace(FIGURE, values={"doractl": [1.0], "journalctl": [1.0]})
