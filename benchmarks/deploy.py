@@ -35,6 +35,9 @@ GAP = "from the last message of the old to the first of the new"
 COUNT = 10
 FILES = 500
 MEGABYTE = 1_000_000
+SETTLED_SECONDS = 65
+"""The age of a file from which on a deploy knows by its times that it has not changed. Nobody
+writes a project of 500 MB just before a deploy."""
 # One write of a fixed length, so that a stamp is whole whenever its node ends.
 SINK = f"""{STAMP}
 node = Node()
@@ -117,10 +120,11 @@ def seconds(act: Callable[[], object]) -> float:
 
 
 def measure_large(project: Project, path: Path) -> list[Figure]:
-    """A project of 500 MB: its first release, and nine with one changed file each."""
+    """A project of 500 MB, a minute old: its first release, and nine with one changed file each."""
     for number in range(FILES):
         project.write(f"data/{number}", "").write_bytes(os.urandom(MEGABYTE))
     keep_all = ("--keep", str(COUNT))
+    time.sleep(SETTLED_SECONDS)
     deploy(project, *keep_all)
     one = used_mb(path / Releases(Cell(NAME)).current())
     took: dict[str, list[float]] = {OURS: [], "cp -r": []}

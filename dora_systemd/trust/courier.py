@@ -43,16 +43,24 @@ _OPEN = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 
 def facts(path: str) -> list[Any] | None:
-    """Path, kind, size, whether it is executable, target and signature; None for nothing."""
+    """Path, kind, size, whether it is executable, target, signature and time of the last change.
+
+    None for nothing.
+    """
     try:
         found = Path(path).lstat()
     except (FileNotFoundError, NotADirectoryError):
         return None
     kind = _KINDS.get(stat.S_IFMT(found.st_mode), "special file")
     target = str(Path(path).readlink()) if kind == "link" else ""
-    signature = f"{found.st_ino} {found.st_size} {found.st_mtime_ns} {found.st_mode}"
     is_executable = bool(found.st_mode & stat.S_IXUSR)
-    return [path, kind, found.st_size, is_executable, target, signature]
+    own = (path, kind, found.st_size, is_executable, target)
+    return [*own, signature(found), found.st_ctime_ns]
+
+
+def signature(found: os.stat_result) -> str:
+    """Numbers of which one differs after a change, unless a program sets the time back."""
+    return f"{found.st_ino} {found.st_size} {found.st_mtime_ns} {found.st_mode}"
 
 
 def listed(path: str, most: int, rules: "Rules | None" = None) -> list[Any]:
@@ -114,13 +122,15 @@ class Rules:
         )
 
 
-def content(path: str) -> Iterator[bytes]:
-    """The content of a regular file."""
-    fd = os.open(path, _OPEN)
+def content(path: str, known: str = "") -> Iterator[bytes]:
+    """The content of a regular file; nothing if it is `known`, see Found.seen."""
+    fd = os.open(path, _OPEN)  # a network file system requests the times of its server only now
     with os.fdopen(fd, "rb", buffering=0) as file:
-        if not stat.S_ISREG(os.fstat(fd).st_mode):
+        found = os.fstat(fd)
+        if not stat.S_ISREG(found.st_mode):
             raise OSError(0, "not a regular file")
-        while chunk := file.read(CHUNK):
+        seen = f"{signature(found)} {found.st_ctime_ns}"
+        while seen != known and (chunk := file.read(CHUNK)):
             yield chunk
 
 
@@ -199,7 +209,7 @@ def answer(request: dict[str, Any]) -> Iterator[bytes]:
     """The data of an answer. Raises OSError."""
     what = request["ask"]
     if what == "read":
-        yield from content(request["path"])
+        yield from content(request["path"], request["known"])
     elif what == "list":
         yield json.dumps(listed(request["path"], request["most"])).encode()
     elif what == "walk":

@@ -114,9 +114,12 @@ class Project:
             found += rows
         return found
 
-    def read(self, path: str) -> Iterator[bytes]:
-        """The content of a file. Raises DoraSystemdError; the caller bounds its length."""
-        yield from self._ask({"ask": "read", "path": path}, path)
+    def read(self, path: str, known: str = "") -> Iterator[bytes]:
+        """The content of a file; nothing if it is `known`, see Found.seen.
+
+        Raises DoraSystemdError; the caller bounds its length.
+        """
+        yield from self._ask({"ask": "read", "path": path, "known": known}, path)
 
     def tracked(self, owners: Sequence[int], most: int) -> tuple[list[str] | None, str]:
         """The files that git would track, None without git, and the revision, "" without one.
@@ -132,7 +135,7 @@ class Project:
         return files, str(value.get("revision", ""))
 
     def _rows(self, rows: Any, path: str) -> list[list[Any]]:
-        types = (str, str, int, bool, str, str)
+        types = (str, str, int, bool, str, str, int)
         is_sound = isinstance(rows, list) and all(
             isinstance(row, list)
             and len(row) == len(types)

@@ -36,7 +36,7 @@ _PROVED = "proved"
 HISTORY = "history"
 _LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 MOST_MANIFEST = 64 * 1024 * 1024
-"""Maximum bytes of release.json: 100,000 files have about 20 MB."""
+"""Maximum bytes of release.json: 100,000 files have about 30 MB."""
 _REMOVE_SECONDS = 300.0
 SYSTEM_STATE = Path("/var/lib")
 

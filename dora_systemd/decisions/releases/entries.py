@@ -4,6 +4,7 @@ The owner of the project names its files and links, so each is checked before ro
 """
 
 import posixpath
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -13,6 +14,8 @@ from dora_systemd.values import format_rounded_size, shown
 MOST_FILES = 100_000
 MOST_BYTES = 4 * 1024**3
 """Maximum number of files and bytes of a release."""
+_SEEN = re.compile(r"(?:[0-9]{1,20} ){4}[0-9]{1,20}", re.ASCII)
+_SETTLED_NS = 60 * 10**9
 _MOST_PATH = 1024
 _MOST_TARGET = 1024
 
@@ -28,7 +31,14 @@ class Found:
     size: int = 0
     is_executable: bool = False
     target: str = ""  # of a link
-    signature: str = ""  # changes with the content
+    signature: str = ""  # changes with the content, see signature() in trust/courier.py
+    # CLOCK_REALTIME of the last change of anything, a new hard link as well
+    changed_ns: int = field(default=0, compare=False)
+
+    @property
+    def seen(self) -> str:
+        """What is recorded of a file, to know later that it has not changed."""
+        return f"{self.signature} {self.changed_ns}"
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,8 @@ class Stored:
     target: str = ""  # only of a link
     # the build has made it; the project has no such file
     is_built: bool = field(default=False, compare=False)
+    # Found.seen of the project's file with this content; "" if its content may change without it
+    seen: str = field(default="", compare=False)
 
 
 def check_found(one: Found) -> None:
@@ -76,6 +88,18 @@ def too_many(path: str) -> DoraSystemdError:
     """The error for a project with more than MOST_FILES files."""
     reason = f"the project has more than {MOST_FILES} files"
     return refusal(path or ".", reason, "name directories of data in .gitignore")
+
+
+def settled(one: Found, at_ns: int) -> str:
+    """Return Found.seen of a file that is read after `at_ns`, if each later change changes that.
+
+    "" for a young one. Two changes can have the same time, and a program that has the file in its
+    memory changes it for half a minute without another time, see vm.dirty_expire_centisecs. Only
+    the time of the last change counts, which no program can set. at_ns: CLOCK_REALTIME.
+    """
+    if not _SEEN.fullmatch(one.seen):
+        return ""
+    return one.seen if at_ns - one.changed_ns > _SETTLED_NS else ""
 
 
 def is_plain_path(path: str) -> bool:

@@ -68,10 +68,10 @@ def parse_manifest(text: str, path: str) -> Manifest:
 
 def format_stored(one: Stored) -> dict[str, Any]:
     """A file for release.json."""
-    built = {"built": True} if one.is_built else {}
+    more = {**({"built": True} if one.is_built else {}), **({"seen": one.seen} if one.seen else {})}
     if one.target:
-        return {"link": one.target, **built}
-    return {"size": one.size, "executable": one.is_executable, "sha256": one.digest, **built}
+        return {"link": one.target, **more}
+    return {"size": one.size, "executable": one.is_executable, "sha256": one.digest, **more}
 
 
 def parse_stored(value: Mapping[str, Any]) -> Stored:
@@ -81,7 +81,8 @@ def parse_stored(value: Mapping[str, Any]) -> Stored:
         return Stored(target=str(value["link"]), is_built=is_built)
     size = _number(value["size"])
     is_executable, digest = bool(value["executable"]), str(value["sha256"])
-    return Stored(size, is_executable, digest, is_built=is_built)
+    seen = str(value.get("seen", ""))
+    return Stored(size, is_executable, digest, is_built=is_built, seen=seen)
 
 
 def _number(value: object) -> int:

@@ -97,7 +97,7 @@ def compare(
     with opened_project(source.root, account_of(source.plan.user)) as project:
         found, _ = find_files(project, source.named, repository_owners(source))
         known = of_project(last.files) if last else {}
-        return last.id if last else "", touched(known, digests(project, found))
+        return last.id if last else "", touched(known, dict(digests(project, found, known)))
 
 
 def present(manager: Manager, scope: Scope, store: Store) -> Manifest | None:
@@ -318,7 +318,7 @@ def _has_files_of(source: Source, manifest: Manifest) -> bool:
         is_alike = found.keys() == known.keys() and all(
             _is_alike(one, known[path]) for path, one in found.items()
         )
-        return is_alike and digests(project, found) == known
+        return is_alike and all(known[path] == one for path, one in digests(project, found, known))
 
 
 def _is_alike(one: Found, known: Stored) -> bool:

@@ -79,7 +79,7 @@ def test_only_a_file_that_was_asked_for_is_named(tmp_path: Path) -> None:
     assert caught.value.message == f"cannot read {tmp_path}/b as user {ME}: no"
 
 
-GOOD = "answer([['a', 'file', 1, False, '', 's'], None])"
+GOOD = "answer([['a', 'file', 1, False, '', 's', 1], None])"
 
 
 @pytest.mark.parametrize(
@@ -89,15 +89,15 @@ GOOD = "answer([['a', 'file', 1, False, '', 's'], None])"
         "answer([])",
         "answer([None])",
         "answer([None, None, None])",
-        "answer([['b', 'file', 1, False, '', 's'], None])",
-        "answer([['a', 'file', 1, False, ''], None])",
+        "answer([['b', 'file', 1, False, '', 's', 1], None])",
+        "answer([['a', 'file', 1, False, '', 's'], None])",
         "answer([['a', 'file', 1, False, '', 's', 's'], None])",
-        "answer([['a', 'file', '1', False, '', 's'], None])",
-        "answer([['a', 'file', 1, 0, '', 's'], None])",
-        "answer([['a', 'file', 1, False, '', None], None])",
-        "answer([['a', 'file', -1, False, '', 's'], None])",
-        "answer([['a', 'file', 2**63, False, '', 's'], None])",
-        "answer([['a', 'file', 1, False, 't' * 4097, 's'], None])",
+        "answer([['a', 'file', '1', False, '', 's', 1], None])",
+        "answer([['a', 'file', 1, 0, '', 's', 1], None])",
+        "answer([['a', 'file', 1, False, '', None, 1], None])",
+        "answer([['a', 'file', -1, False, '', 's', 1], None])",
+        "answer([['a', 'file', 2**63, False, '', 's', 1], None])",
+        "answer([['a', 'file', 1, False, 't' * 4097, 's', 1], None])",
         "answer(['afile1', None])",
     ],
 )
@@ -110,7 +110,7 @@ def test_facts_that_are_none(tmp_path: Path, lie: str) -> None:
 
 
 def test_the_largest_facts_that_are_believed(tmp_path: Path) -> None:
-    largest = f"answer([['a', 'file', 2**63 - 1, False, '{'t' * 4096}', 's'], None])"
+    largest = f"answer([['a', 'file', 2**63 - 1, False, '{'t' * 4096}', 's', 1], None])"
     for text in (GOOD, largest, GOOD.replace("1,", "0,")):
         with opened_liar(tmp_path, text) as project:
             found, missing = project.facts(["a", "b"])

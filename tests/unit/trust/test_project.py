@@ -91,7 +91,7 @@ def test_a_git_above_that_ignores_all_of_it(root: Path) -> None:
 
 def row(path: str = "a", size: int | str = 1) -> str:
     """Code that answers with a row."""
-    return f"answer([[{path!r}, 'file', {size}, False, '', 's']])"
+    return f"answer([[{path!r}, 'file', {size}, False, '', 's', 1]])"
 
 
 LIARS = {

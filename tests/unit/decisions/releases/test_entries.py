@@ -15,6 +15,7 @@ from dora_systemd.decisions.releases.entries import (
     check_amount,
     check_found,
     is_plain_path,
+    settled,
     too_many,
     touched,
 )
@@ -153,6 +154,25 @@ def test_the_longest_target() -> None:
     check_found(Found("l", LINK, target="é" * 1024))
     with pytest.raises(DoraSystemdError, match="its target is not printable text"):
         check_found(Found("l", LINK, target="é" * 1025))
+
+
+@pytest.mark.parametrize(
+    ("signature", "changed_ns", "at_s", "is_settled"),
+    [
+        ("7 4 5 33188", 10**9, 62, True),
+        ("7 4 5 33188", 10**9, 61, False),
+        ("7 4 5 33188", 10**9, 0, False),  # the clock was ahead
+        ("7 4 33188", 10**9, 62, False),
+        ("7 4 5 33188", -1, 62, False),
+        ("7 4 5 33188", 10**20, 10**30, False),
+        ("", 10**9, 62, False),
+    ],
+)
+def test_only_an_old_time_says_that_a_file_is_the_same(
+    signature: str, changed_ns: int, at_s: int, is_settled: bool
+) -> None:
+    one = Found("a", FILE, signature=signature, changed_ns=changed_ns)
+    assert settled(one, at_s * 10**9) == (one.seen if is_settled else "")
 
 
 def test_the_words_for_too_much() -> None:

@@ -1,7 +1,9 @@
 """Which files of a project are copied, and that none is copied in half."""
 
+import os
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -112,12 +114,74 @@ def copied(project: Project, store: Store, found: dict[str, Found]) -> dict[str,
 def test_copies_share_what_is_the_same(root: Path, project: Project, store: Store) -> None:
     found, _ = find_files(project, [], [])
     first = copied(project, store, found)
-    assert first == digests(project, found)
+    assert first == dict(digests(project, found, {}))
     (root / "a.py").write_text("else")
     second = copied(project, store, find_files(project, [], [])[0])
     assert {one for one in first if first[one] != second[one]} == {"a.py"}
     links = {path: (store.tree(FIRST) / path).stat().st_nlink for path in first}
     assert links == {"a.py": 1, "models/m.onnx": 2, "target/release/node": 2}
+
+
+class Reads:
+    """A project, and the bytes of its files that are read."""
+
+    def __init__(self, project: Project) -> None:
+        self._project = project
+        self.size = 0
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._project, name)
+
+    def read(self, path: str, known: str = "") -> Iterator[bytes]:
+        for chunk in self._project.read(path, known):
+            self.size += len(chunk)
+            yield chunk
+
+
+def aged(found: dict[str, Found], stored: dict[str, Stored]) -> dict[str, Stored]:
+    """What a release would have of these files if they were older than a minute."""
+    return {path: replace(one, seen=found[path].seen) for path, one in stored.items()}
+
+
+def test_files_that_have_not_changed_are_not_read(
+    root: Path, project: Project, store: Store
+) -> None:
+    found, _ = find_files(project, [], [])
+    first = copied(project, store, found)
+    assert not any(one.seen for one in first.values()), "they are young"
+    manifest = store.manifest(FIRST)
+    store.write_manifest(replace(manifest, files=aged(found, first)))
+    known = store.manifest(FIRST).files
+    assert [one.seen for one in known.values()] == [one.seen for one in found.values()]
+    text = (root / "a.py").read_text()
+    (root / "a.py").write_text(text.upper())
+    os.utime(root / "a.py", ns=(1, (root / "models/m.onnx").stat().st_mtime_ns))
+    now, _ = find_files(project, [], [])
+    reads = Reads(project)
+    compared = dict(digests(reads, now, known))  # type: ignore[arg-type]
+    assert {path for path, one in compared.items() if one != known[path]} == {"a.py"}
+    assert reads.size == len(text)
+    second = copied(reads, store, now)  # type: ignore[arg-type]
+    assert second == dict(digests(project, now, {}))
+    assert reads.size == 3 * len(text), "compared, and copied"
+    assert store.intact(store.manifest("20261122T220012")) == second
+
+
+class Liar(Reads):
+    """A project whose reader says of each file that the file has not changed."""
+
+    def read(self, path: str, known: str = "") -> Iterator[bytes]:
+        yield from [] if known else super().read(path)
+
+
+def test_an_owner_who_lies_gets_the_former_content(
+    root: Path, project: Project, store: Store
+) -> None:
+    first = copied(project, store, find_files(project, [], [])[0])
+    (root / "a.py").write_text("y.pa")
+    found, _ = find_files(project, [], [])
+    known = aged(found, first)
+    assert dict(digests(Liar(project), found, known)) == first  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("root")
@@ -128,7 +192,7 @@ def test_copies_heal_what_the_disk_has_damaged(project: Project, store: Store) -
     damaged.chmod(0o600)
     damaged.write_text("models/m.onny")
     second = copied(project, store, found)
-    assert second == digests(project, found)
+    assert second == dict(digests(project, found, {}))
     assert store.intact(store.manifest("20261122T220012")) == second
 
 
