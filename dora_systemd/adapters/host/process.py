@@ -7,14 +7,16 @@ import selectors
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 from subprocess import Popen
 from threading import Thread
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from dora_systemd.errors import DoraSystemdError, TimedOut
 from dora_systemd.trust.programs import Account, spawn
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 T = TypeVar("T")
 
@@ -76,6 +78,9 @@ def beside(call: Callable[[], T]) -> "Future[T]":
 
     Not a daemon thread, so that a child is reaped even if nothing uses the result.
     """
+    # Imported late: it imports logging, and most commands need no thread.
+    from concurrent.futures import Future
+
     future: Future[T] = Future()
     future.set_running_or_notify_cancel()  # a task that waits for it may be cancelled, but not this
 

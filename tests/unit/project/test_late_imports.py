@@ -27,6 +27,9 @@ LATE = {
     "a report of what this machine knows reads no bundle": {
         "cli.verbs.look.why": {"verbs.bundles.listing"},
     },
+    "it imports logging, and most commands run nothing in a thread": {
+        "adapters.host.process": {"concurrent.futures"},
+    },
     "only some verbs wrap, and only on a terminal": {
         "terminal_text": {"textwrap"},
     },
