@@ -4,7 +4,6 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, lacking
 from dora_systemd.decisions.views.findings import Finding, State, assigned
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import format_duration, parse_duration
@@ -56,6 +55,9 @@ class Process:
 
 def judge_systemd(version: str) -> Finding:
     """Whether this version of systemd supports all properties that a dataflow may need."""
+    # Imported late: it has all properties, and verbs that read processes judge no systemd.
+    from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, lacking
+
     match = re.match(r"\d+", version)
     number = int(match[0]) if match else MIN_VERSION
     if number < MIN_VERSION:

@@ -30,6 +30,9 @@ LATE = {
     "it imports logging, and most commands run nothing in a thread": {
         "adapters.host.process": {"concurrent.futures"},
     },
+    "it has all properties, and verbs that read processes judge no systemd": {
+        "decisions.views.diagnosis": {"decisions.unit.systemd_versions"},
+    },
     "only some verbs wrap, and only on a terminal": {
         "terminal_text": {"textwrap"},
     },
