@@ -229,3 +229,40 @@ def stop(cell: Cell) -> None:
     cell.doractl("stop", cell.name, check=False)
     print(f"stop: {time.monotonic() - begun:.2f} s")
     assert cell.is_gone
+
+
+DOWN = """[Unit]
+Requires=basic.target
+Wants=lab-command.service systemd-journald.service dbus.service
+AllowIsolate=yes
+"""
+
+
+def test_shut_down_right_after_the_end_of_a_recording(
+    running: Cell, ours: Recorder, flow: Path
+) -> None:
+    """A container cannot reboot: all services stop as at a shutdown, and start as at a boot."""
+    stop(running)
+    running.start(flow, "--enable", "--env", "DATASET=boot")
+    boot = Recorder(STATE / "boot", ours.port)
+    boot.warm_up()
+    number = boot.begin(10)
+    boot.post("success")
+    target = Path("/run/systemd/system/lab-down.target")
+    try:
+        target.write_text(DOWN)
+        run("systemctl", "daemon-reload")
+        run("systemctl", "isolate", target.name)
+        wait_for("it has stopped", lambda: running.show("ActiveState") == "inactive", 60)
+        assert boot.listed() == [number]
+        whole = boot.read(number)
+        assert min(len(times) for times in whole.times.values()) >= 10
+        run("systemctl", "start", "multi-user.target")
+        wait_for("it runs", lambda: running.show("ActiveState") == "active", 60)
+        boot.wait_page()
+        # The page counts from 0 again, and the recorder refuses an episode that is there already.
+        assert (boot.listed(), boot.number()) == ([number], 0)
+        assert boot.read(number) == whole
+    finally:
+        target.unlink()
+        running.doractl("disable", running.name)
