@@ -50,6 +50,7 @@ import('/page/why.js').then(({ Why }) => {
 
 def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
     browser.wait_text("#none", "doractl start")
+    assert faults(browser) == []
     cell.start(project.three_nodes())
     browser.wait_text("#list .card", cell.name)
     browser.wait_text("#detail h1", cell.name)
@@ -126,6 +127,7 @@ def test_buttons(browser: Browser, cell: Cell, project: Project) -> None:
     browser.wait_js("!document.querySelector('#confirm').open")
     browser.click(f"{node('sink')} .buttons button")
     browser.wait_js("document.querySelector('#confirm').open")
+    assert faults(browser) == []
     browser.picture("confirm")
     browser.click("#confirmed")
     browser.wait_text("#said", "Node restarting: sink")
@@ -218,6 +220,7 @@ def test_disconnected_and_back(
     browser.wait_text("#link", "disconnected")
     assert browser.js("document.querySelector('#detail [data-action=stop]').disabled")
     browser.wait_text("#problem", "doractl up")
+    assert faults(browser) == []
     front.systemctl("start", SOCKET_UNIT)
     browser.click("#again")
     browser.wait_text("#link", "live")

@@ -8,7 +8,7 @@ import pytest
 
 from tests.system.cells import Project, journalctl, run, wait_for
 from tests.system.chromium import Browser
-from tests.system.pages import CONTRAST
+from tests.system.pages import CONTRAST, faults
 from tests.system.releases import Releases, write_version
 from tests.system.test_inhibit import inhibiting
 
@@ -62,6 +62,7 @@ def test_roll_back(browser: Browser, releases: Releases, project: Project, flag:
     browser.resize(360, 740, is_phone=True)
     assert browser.wait_js("document.documentElement.scrollWidth") == 360
     assert browser.js(CONTRAST) == []
+    assert faults(browser) == []
     browser.picture("releases-phone", is_whole=True)
     browser.resize(1200, 900)
     # No means no.

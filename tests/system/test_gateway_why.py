@@ -236,11 +236,13 @@ def test_limits_are_changed(browser: Browser, cell: Cell, project: Project) -> N
     cell.start(project.three_nodes())
     browser.wait_text("#detail dl", "Sandbox")
     browser.click("#detail .menu summary")
+    assert faults(browser) == []
     browser.press("Escape")
     assert not browser.js("document.querySelector('#detail .menu').open")
     choose(browser, "set")
     browser.wait_text("#question", f"Limits of {cell.name}")
     assert browser.js("document.activeElement.id") == "memory_limit"
+    assert faults(browser) == []
     browser.picture("limits")
     browser.js("document.querySelector('#memory_limit').value = 'much', 0")
     browser.click("#confirmed")
@@ -300,6 +302,8 @@ def test_one_that_has_ended(browser: Browser, front: Front, cell: Cell, project:
     browser.wait_text("#detail .why .summary", "(doractl stop)")
     browser.wait_text(f"{node('sink')} .badge", "Stopped")
     browser.wait_text("#ended summary", "Ended (")
+    browser.js("document.querySelector('#ended').open = true")
+    assert faults(browser) == []
     # By its address, later.
     browser.open(f"http://127.0.0.1:{front.port}/?later#{uuid}")
     browser.wait_text("#detail h1", cell.name)
@@ -308,6 +312,7 @@ def test_one_that_has_ended(browser: Browser, front: Front, cell: Cell, project:
     # What nobody knows has a word, and a way back.
     browser.js(f"location.hash = '#{NOBODY}', 0")
     browser.wait_text("#gone", "no longer there")
+    assert faults(browser) == []
     browser.click("#gone .back")
     browser.wait_text("#none", "No dataflow is running")
     assert browser.failures() == []

@@ -17,13 +17,16 @@ const MOST_NAMED = 3;
 const LEAST = { cpu: 10, memory: 1 << 20 };
 const EVERY_US = 60e6;
 const PAUSE_US = 5e6;
+// Of the time between two requests the gateway is busy for at most so much.
+const SHARE = 0.02;
 
 const now = () => Date.now() * 1000;
 
 export class Timeline {
   /** ask: requests the timeline of the gateway. showLog: is called with a time in µs. */
   constructor(ask, showLog) {
-    Object.assign(this, { ask, showLog, data: null, version: 0, points: [], askedAt: 0, isDue: true });
+    Object.assign(this, { ask, showLog, data: null, version: 0, points: [], askedAt: 0, isDue: true,
+      pause: PAUSE_US });
     this.range = el("select", { id: "past-range", onchange: () => this.#draw() },
       ...RANGES.map(([hours, text]) => el("option", { value: hours, selected: hours === USUAL }, text)));
     this.note = el("p", { class: "muted note", hidden: true });
@@ -40,6 +43,7 @@ export class Timeline {
 
   /** A message of that type. */
   take(data) {
+    this.pause = Math.max(PAUSE_US, (now() - this.askedAt) / SHARE);
     if (data.lives && !this.data) this.range.value = rangeFor(data);
     this.data = data.lives ? data : this.data;
     this.version += 1;
@@ -52,7 +56,7 @@ export class Timeline {
   show(flow, points) {
     Object.assign(this, { flow, points });
     const age = now() - this.askedAt;
-    if (age > EVERY_US || (this.isDue && age > PAUSE_US)) {
+    if (age > EVERY_US || (this.isDue && age > this.pause)) {
       Object.assign(this, { askedAt: now(), isDue: false });
       this.ask();
     }
