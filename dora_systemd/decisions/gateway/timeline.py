@@ -8,6 +8,7 @@ from typing import Any
 
 from dora_systemd.decisions.logs.journal_events import (
     BUILD_FAILED,
+    BUNDLE_REFUSED,
     BUNDLE_WRITTEN,
     END_EVENTS,
     GIVEN_UP,
@@ -34,7 +35,7 @@ MARKS = {
     **dict.fromkeys(("node-silent", "node-speaks-again"), "silence"),
     "release-committed": "deploy",
     **dict.fromkeys((ROLLED_BACK, BUILD_FAILED), "rollback"),
-    BUNDLE_WRITTEN: "bundle",
+    **dict.fromkeys((BUNDLE_WRITTEN, BUNDLE_REFUSED), "bundle"),
 }
 """The kind of the mark of each event."""
 EVENTS = (
@@ -42,7 +43,7 @@ EVENTS = (
     *(one for one in MARKS if not one.startswith(("unit-", "start-limit"))),
 )
 """Those of our events that the timeline shows."""
-OUTSIDE = (START_ASKED, BUNDLE_WRITTEN)
+OUTSIDE = (START_ASKED, BUNDLE_WRITTEN, BUNDLE_REFUSED)
 """What doractl writes outside of any life of the dataflow."""
 _UNIT_ENDS = ("unit-succeeded", "unit-failed")
 

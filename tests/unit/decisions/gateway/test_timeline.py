@@ -54,13 +54,14 @@ def test_the_last_life_has_ended_if_the_dataflow_is_down() -> None:
 def test_requests_outside_belong_to_no_life() -> None:
     asked = one("start-asked", 5, "of doractl")
     written = one("bundle-written", 50, "of doractl")
+    refused = one("bundle-refused", 51, "of doranotice")
     stop = one("stop-asked", 40, "of doractl", by="root (doractl stop)")
     end = one("dataflow-stopped", 41, "2")
-    found = timeline_values((asked, *TWO_LIVES, stop, end, written), OWN, False, "boot")
+    found = timeline_values((asked, *TWO_LIVES, stop, end, written, refused), OWN, False, "boot")
     assert len(found["lives"]) == 2
     assert found["lives"][1]["text"] == "stopped by root (doractl stop)"
     kinds = [mark["kind"] for mark in found["marks"]]
-    assert (kinds[0], kinds[-2:]) == ("request", ["request", "bundle"])
+    assert (kinds[0], kinds[-3:]) == ("request", ["request", "bundle", "bundle"])
 
 
 def test_lives_of_another_dataflow_of_that_name_are_left_out() -> None:
