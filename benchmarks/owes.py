@@ -40,7 +40,7 @@ YAML = """nodes:
   - {{id: receiver, path: receiver.py, args: {file}, inputs: {{image: sender/image}}}}
 """
 PLAIN = "not watched"
-FLAGS = {OURS: ("--owes", "sender/image:within=5s"), PLAIN: ()}
+FLAGS = {OURS: ("--node", "sender:owes=image:within=5s"), PLAIN: ()}
 
 
 def stamps(name: str) -> Path:

@@ -242,5 +242,5 @@ def _check(report: AdviceReport, project: Project, text: str) -> None:
         if one.place in places:
             who = f"node {one.node}" if one.node else report.name
             message = f"cannot change {one.setting} of {who} in {shown(str(path))}"
-            hint = "a flag of its start, or node_limit or owes for the dataflow, takes precedence"
+            hint = "a flag of its start takes precedence"
             raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

@@ -16,8 +16,8 @@ from dora_systemd.adapters.host.unit_files import (
 )
 from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.environment import changes_entry, changes_of, with_changes
-from dora_systemd.decisions.cell.line_rates import RateLimits, format_rates, rates_of
-from dora_systemd.decisions.cell.options import SettingText, changed
+from dora_systemd.decisions.cell.line_rates import RateLimits, rate_texts, rates_of
+from dora_systemd.decisions.cell.options import SettingText, changed, format_setting
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.recorder.record import format_record, parse_record
 from dora_systemd.decisions.unit.properties import format_unit
@@ -129,7 +129,7 @@ def limit_lines(
 
 
 def _rates_request(rates: RateLimits) -> Mapping[str, Any]:
-    return {"verb": "log-rates", "limits": format_rates(rates)}
+    return {"verb": "log-rates", "limits": [*map(format_setting, rate_texts(rates))]}
 
 
 def _refuse_release(cell: Cell) -> None:

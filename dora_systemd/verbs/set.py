@@ -16,13 +16,12 @@ from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.limits import limit_groups
 from dora_systemd.adapters.runner_socket.client import order
 from dora_systemd.decisions.cell import line_rates
-from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, check_nodes
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, check_nodes, node_limits
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.settings.limit_checks import check_cpus, check_use, size_warnings
-from dora_systemd.decisions.settings.limits import NODE_LIMIT
-from dora_systemd.decisions.settings.log_rates import LOG_RATE_LIMIT
-from dora_systemd.decisions.settings.resolve import resolve_settings, runner_texts
+from dora_systemd.decisions.settings.limits import LOG_RATE_LIMIT
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings, runner_texts
 from dora_systemd.decisions.settings.table import CHANGEABLE
 from dora_systemd.decisions.unit.properties import settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -51,8 +50,7 @@ def set_limits(
     usage. `ask`: sends a request to the runner. Raises DoraSystemdError; then nothing is changed.
     """
     settings = resolve_settings(flags, {}, (), CHANGEABLE)
-    properties, nodes = settings_properties(settings), settings[NODE_LIMIT]
-    rates = settings[LOG_RATE_LIMIT]
+    properties, nodes, rates = settings_properties(settings), _limits(settings), _rates(settings)
     if not properties and not nodes and not rates:
         hint = "see doractl set --help"
         message = f"cannot change the limits of {cell.name}: none is given"
@@ -66,7 +64,7 @@ def set_limits(
     check_cpus(nodes, read_machine())
     require_controllers(manager, scope, properties, nodes)
     unit = manager.read(cell.unit, _PROPERTIES)
-    values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}
+    values = {key: settings.values[key] for key in BY_KEY}
     warnings = (*size_warnings(values, nodes, read_machine()), *_placed_warnings(cell, rates))
     if unit["ControlGroup"] and not is_forced:
         group = cgroup.group_path(unit["ControlGroup"])
@@ -86,6 +84,17 @@ def set_limits(
             manager.reload()
         undo.pop_all()
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
+
+
+def _limits(settings: Settings) -> tuple[NodeLimits, ...]:
+    found = (node_limits(node, values) for node, values in settings.nodes.items())
+    return tuple(one for one in found if one.limits)
+
+
+def _rates(settings: Settings) -> line_rates.RateLimits:
+    of_all = {line_rates.ALL_NODES: settings[LOG_RATE_LIMIT]}
+    of_nodes = settings.by_node(LOG_RATE_LIMIT)
+    return {**(of_all if settings.is_given(LOG_RATE_LIMIT) else {}), **of_nodes}
 
 
 def _refuse_placed(cell: Cell, nodes: Iterable[str]) -> None:

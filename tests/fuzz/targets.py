@@ -23,8 +23,6 @@ from dora_systemd.decisions.bundles.manifest import parse_manifest
 from dora_systemd.decisions.cell.environment import SET_VARIABLE, changes_of
 from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.exits import parse_exit
-from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.cell.line_rates import parse_rates
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow, parse_session
 from dora_systemd.decisions.dora.coordinator import parse_coordinator
@@ -70,7 +68,7 @@ from dora_systemd.decisions.releases.parcel import (
 from dora_systemd.decisions.releases.program_versions import parse_versions
 from dora_systemd.decisions.releases.progress import soaking
 from dora_systemd.decisions.settings.resolve import resolve_settings
-from dora_systemd.decisions.settings.table import SETTINGS
+from dora_systemd.decisions.settings.table import NODES, SETTINGS
 from dora_systemd.decisions.why.lives import Life, find_lives, parse_happening
 from dora_systemd.decisions.why.stack import Crash, dump_frames, find_dump, python_frames
 from dora_systemd.errors import DoraSystemdError
@@ -309,9 +307,7 @@ TARGETS = {
     "property": Target(lambda data: parse_property(text_of(data)), REFUSED),
     "values": Target(_of_text(parse_size, parse_duration, parse_cpu, parse_bool)),
     "names": Target(_of_text(parse_name, parse_uuid, name_from_path)),
-    "limits": Target(
-        _of_text(parse_node_limits, lambda text: parse_rates(text.split(";")), _changes)
-    ),
+    "limits": Target(_of_text(lambda text: NODES.kind.parse(text.split(";"), None), _changes)),
     "exit": Target(_of_text(parse_exit, parse_dora_error, parse_filter)),
     "parcel": Target(_parcel, REFUSED),
     "ring": Target(_ring, (ValueError,)),

@@ -100,14 +100,14 @@ def test_what_cannot_be_made_of_it(flow: Flow) -> None:
         assert "doractl restart flow" in done.stderr
     assert run("systemctl", "reload", flow.cell.unit, check=False).returncode == 1
     assert flow.life() == life
-    limit = flow.cell.doractl("set", NAME, "--node-limit=sink:memory=1G", check=False)
+    limit = flow.cell.doractl("set", NAME, "--node=sink:memory_limit=1G", check=False)
     assert "it runs on machine arm" in limit.stderr
 
 
 def test_a_plan_shows_all_units() -> None:
     flow = Flow({"gpu": "b"})
     flow.bring()
-    more = ("--name", "other", "--env", "A=1", "--node-limit", "doubler:memory=1G")
+    more = ("--name", "other", "--env", "A=1", "--node", "doubler:memory_limit=1G")
     shown = run("doractl", "start", FILE, *flow.flags(), *more, "--dry-run").stdout
     head, _, link = shown.partition("\n# doralink-other:gpu.service\n")
     assert "--placed=doubler=gpu" in head

@@ -263,7 +263,7 @@ def test_limits_of_a_node_are_changed(browser: Browser, cell: Cell, project: Pro
     cell.start(project.three_nodes())
     browser.wait_text("#detail dl", "Sandbox")
     button = "[aria-label='Limits sink']"
-    for given, shown in (("500", "sink:tasks=500"), ("", "\nnone\n")):
+    for given, shown in (("500", "sink:tasks_limit=500"), ("", "\nnone\n")):
         browser.wait_js(f'!document.querySelector("{button}").disabled')
         browser.click(button)
         browser.wait_text("#question", f"Limits of node sink of {cell.name}")

@@ -14,8 +14,8 @@ BAD_LIMITS = (
     *("--memory-limit=0", "--memory-limit=-1", "--memory-limit=4 gigs", "--memory-limit=4"),
     *("--cpu-limit=0", "--cpu-limit=-2", "--cpu-limit=two", "--tasks-limit=0"),
     *("--cpu-weight=0", "--io-weight=10001", "--nice=20", "--realtime=0", "--device=video0"),
-    *("--node-limit=sink", "--node-limit=sink:memory=0", "--node-limit=sink:mem=1G"),
-    *("--node-limit=sink:cpu=-1", "--node-limit=:cpu=1"),
+    *("--node=sink", "--node=sink:memory_limit=0", "--node=sink:mem=1G"),
+    *("--node=sink:cpu_limit=-1", "--node=:cpu_limit=1"),
 )
 
 
@@ -23,8 +23,8 @@ def test_bad_limits(cell: Cell, project: Project) -> None:
     flow = str(project.three_nodes())
     refusals = [Refusal([flow, limit], ExitCode.USAGE, limit.split("=")[0]) for limit in BAD_LIMITS]
     there = "nodes: source, doubler, sink"
-    refusals.append(Refusal([flow, "--node-limit=x:cpu=1"], ExitCode.BAD_INPUT, there))
-    refusals.append(Refusal([flow, "--node-limit=Sink:cpu=1"], ExitCode.BAD_INPUT, "mean sink?"))
+    refusals.append(Refusal([flow, "--node=x:cpu_limit=1"], ExitCode.BAD_INPUT, there))
+    refusals.append(Refusal([flow, "--node=Sink:cpu_limit=1"], ExitCode.BAD_INPUT, "mean sink?"))
     check_refusals(cell, project, refusals)
 
 
@@ -46,10 +46,10 @@ def test_limits_without_controllers(cell: Cell, project: Project) -> None:
     missing = {"cpu", "memory", "pids", "io"} - read_controllers(MOUNT)
     flow = str(project.three_nodes())
     flags = {
-        "memory": ("--memory-limit=1G", "--node-limit=sink:memory=1G", "--property=MemoryHigh=1G"),
+        "memory": ("--memory-limit=1G", "--node=sink:memory_limit=1G", "--property=MemoryHigh=1G"),
         "cpu": ("--cpu-limit=1", "--cpu-weight=50"),
         "pids": ("--tasks-limit=100",),
-        "io": ("--io-weight=50", "--node-limit=sink:io-weight=50"),
+        "io": ("--io-weight=50", "--node=sink:io_weight=50"),
     }
     words = "systemd has no"
     check_refusals(
@@ -77,9 +77,9 @@ BAD_CHANGES = {
     ("--memory-limit=0",): ExitCode.USAGE,
     ("--memory-limit=4 gigs",): ExitCode.USAGE,
     ("--nice=5",): ExitCode.USAGE,
-    ("--node-limit=sink",): ExitCode.USAGE,
-    ("--node-limit=x:cpu=infinity",): ExitCode.BAD_INPUT,
-    ("--node-limit=sink:cpu=infinity", "--node-limit=Sink:cpu=infinity"): ExitCode.BAD_INPUT,
+    ("--node=sink",): ExitCode.USAGE,
+    ("--node=x:cpu_limit=infinity",): ExitCode.BAD_INPUT,
+    ("--node=sink:cpu_limit=infinity", "--node=Sink:cpu_limit=infinity"): ExitCode.BAD_INPUT,
 }
 
 
@@ -103,7 +103,7 @@ def test_bad_changes(cell: Cell, project: Project) -> None:
 def test_changes_are_remembered_while_the_dataflow_is_there(cell: Cell, project: Project) -> None:
     """Lifting what is not limited needs no controller: the way there and back can be seen."""
     cell.start(project.three_nodes())
-    cell.doractl("set", cell.unit, "--node-limit=sink:cpu=infinity", "--tasks-limit=infinity")
+    cell.doractl("set", cell.unit, "--node=sink:cpu_limit=infinity", "--tasks-limit=infinity")
     (run, unit) = cell.status.run, cell.doractl("show", cell.name).stdout
     assert "DORA_SYSTEMD_SET=sink:cpu_limit=infinity" in unit
     cell.doractl("restart", cell.name)

@@ -1,4 +1,4 @@
-"""`doractl set --log-rate-limit`: a node is quieted while it runs, and after a restart."""
+"""`doractl set --node sink:log_rate_limit=`: a node is quieted while it runs, and restarted."""
 
 import pytest
 
@@ -21,16 +21,16 @@ def has_all(cell: Cell) -> bool:
 
 @pytest.mark.warns("exceed its limit")
 def test_at_once_and_after_a_restart(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes(), "--log-rate-limit", "source=infinity")
+    cell.start(project.three_nodes(), "--node", "source:log_rate_limit=infinity")
     runner = cell.supervisor_pid("runner")
-    done = cell.doractl("set", cell.name, "--log-rate-limit", "sink=1/1s")
+    done = cell.doractl("set", cell.name, "--node", "sink:log_rate_limit=1/1s")
     assert done.stdout.startswith("Limits changed: ")
     wait_for("lines are suppressed", lambda: suppressed(cell))
     assert cell.supervisor_pid("runner") == runner
     cell.doractl("restart", cell.name)
     wait_for("they are again", lambda: suppressed(cell))
     assert set(suppressed(cell)) == {("sink", "1/1s")}
-    cell.doractl("set", cell.name, "--log-rate-limit", "sink=infinity")
+    cell.doractl("set", cell.name, "--node", "sink:log_rate_limit=infinity")
     wait_for("all lines are there", lambda: has_all(cell))
     variables = "DORA_SYSTEMD_SET=sink:log_rate_limit=infinity"
     assert variables in cell.doractl("show", cell.name).stdout
@@ -39,8 +39,9 @@ def test_at_once_and_after_a_restart(cell: Cell, project: Project) -> None:
 def test_wrong_ones_change_nothing(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     before = cell.doractl("show", cell.name).stdout
-    for text, status in (("sinc=1/1s", ExitCode.BAD_INPUT), ("sink=much", ExitCode.USAGE)):
-        words = ("--log-rate-limit", "source=1/1s", "--log-rate-limit", text)
+    for text, status in (("sinc:1/1s", ExitCode.BAD_INPUT), ("sink:much", ExitCode.USAGE)):
+        wrong = text.replace(":", ":log_rate_limit=")
+        words = ("--node", "source:log_rate_limit=1/1s", "--node", wrong)
         done = cell.doractl("set", cell.name, *words, check=False)
         assert (done.returncode, len(done.stderr.splitlines())) == (status, 2)
     assert cell.doractl("show", cell.name).stdout == before

@@ -279,7 +279,7 @@ def test_limits_of_nodes(cell: Cell, project: Project) -> None:
     flow = project.write("dataflow.yml", f"nodes: {nodes}")
     limits = "nodes: {few: {log_rate_limit: 500/1s}, all: {log_rate_limit: infinity}}"
     project.write("dataflow.systemd.yml", limits)
-    cell.start(flow, "--log-rate-limit", "1/1h", "--log-rate-limit", "by-dora=700/200ms")
+    cell.start(flow, "--log-rate-limit", "1/1h", "--node", "by-dora:log_rate_limit=700/200ms")
     wait_end(cell)
     assert printed(cell, "all") == numbered(LINES)
     for node, least in (("few", 500), ("by-dora", 700)):

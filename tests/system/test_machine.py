@@ -96,7 +96,7 @@ def test_a_node_over_its_limit_is_killed_alone(cell: Cell, project: Project) -> 
     flow = project.three_nodes()
     project.write("sink.py", CHILD + LEAK)
     flow.write_text(flow.read_text() + "    restart_policy: on-failure\n    restart_delay: 2\n")
-    cell.start(flow, "--node-limit=sink:memory=300M,swap=0")
+    cell.start(flow, "--node=sink:memory_limit=300M,swap_limit=0")
     before = cell.pids("node-source") + cell.pids("node-doubler")
     (event,) = wait_for("it is out of memory", lambda: cell.journal("DORA_EVENT=node-oom"), 300)
     assert (event["DORA_NODE"], event["DORA_OWNER"]) == ("sink", "node")
@@ -134,7 +134,7 @@ for event in node:
 def test_memory_that_gets_short_is_reported_once(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     project.write("sink.py", HOARD)
-    cell.start(flow, "--node-limit=sink:memory=600M,swap=0")
+    cell.start(flow, "--node=sink:memory_limit=600M,swap_limit=0")
     wait_for("it is full", lambda: cell.messages("sink"), 60)
     (event,) = wait_for("it is told", lambda: cell.journal("DORA_EVENT=memory-pressure"), 60)
     assert (event["DORA_NODE"], int(event["DORA_LIMIT"])) == ("sink", 600 << 20)
@@ -144,7 +144,8 @@ def test_memory_that_gets_short_is_reported_once(cell: Cell, project: Project) -
 
 
 LIMITED = (
-    "sink:memory=300M,memory-high=infinity,swap=0,cpu=1.5,tasks=200,cpu-weight=50,io-weight=20"
+    "sink:memory_limit=300M,memory_high=infinity,swap_limit=0,cpu_limit=1.5,tasks_limit=200,"
+    "cpu_weight=50,io_weight=20"
 )
 
 
@@ -152,7 +153,7 @@ LIMITED = (
 def test_limits_are_what_the_kernel_holds_up(cell: Cell, project: Project) -> None:
     flow = slow_flow(project)
     project.write("dataflow.systemd.yml", "nodes: {source: {memory_limit: 1G}}\nmemory_high: 2G\n")
-    cell.start(flow, "--memory-limit=1500M", "--cpu-limit=1.5", f"--node-limit={LIMITED}")
+    cell.start(flow, "--memory-limit=1500M", "--cpu-limit=1.5", f"--node={LIMITED}")
     assert control(cell, ".", "memory.max") == str(1500 << 20)
     assert control(cell, ".", "memory.high") == str(2 << 30)
     assert control(cell, ".", "cpu.max") == "150000 100000"
@@ -173,10 +174,10 @@ def test_limits_are_what_the_kernel_holds_up(cell: Cell, project: Project) -> No
 @pytest.mark.vm
 def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> None:
     flow = slow_flow(project)
-    cell.start(flow, "--enable", "--node-limit=sink:memory=1G,cpu-weight=30")
-    changes = ("--memory-limit=1500M", "--node-limit=source:tasks=77")
+    cell.start(flow, "--enable", "--node=sink:memory_limit=1G,cpu_weight=30")
+    changes = ("--memory-limit=1500M", "--node=source:tasks_limit=77")
     done = cell.doractl(
-        "set", cell.status.uuid[:8], *changes, "--node-limit=sink:cpu=0.8,memory=600M"
+        "set", cell.status.uuid[:8], *changes, "--node=sink:cpu_limit=0.8,memory_limit=600M"
     )
     assert done.stderr == ""
     changed = [str(1500 << 20), str(600 << 20), "80000 100000", "30", "77"]
@@ -186,7 +187,7 @@ def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> 
     text = cell.doractl("show", cell.name).stdout
     assert "MemoryMax=1572864000" in text
     assert "sink:cpu_limit=80%% sink:memory_limit=600M" in text
-    bad = cell.doractl("set", cell.unit, "--memory-limit=2G", "--node-limit=x:cpu=1", check=False)
+    bad = cell.doractl("set", cell.unit, "--memory-limit=2G", "--node=x:cpu_limit=1", check=False)
     assert bad.returncode == ExitCode.BAD_INPUT
     assert held(cell) == changed
     cell.doractl("stop", cell.name)
@@ -205,8 +206,8 @@ def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> 
 
 def check_lifted(cell: Cell) -> None:
     """All limits can be lifted while messages are exchanged."""
-    lifted = "sink:cpu=infinity,memory=infinity"
-    cell.doractl("set", cell.name, "--memory-limit=infinity", f"--node-limit={lifted}")
+    lifted = "sink:cpu_limit=infinity,memory_limit=infinity"
+    cell.doractl("set", cell.name, "--memory-limit=infinity", f"--node={lifted}")
     assert held(cell) == ["max", "max", "max 100000", "30", "77"]
     cell.wait_exchanging()
 
@@ -297,7 +298,7 @@ while True:
 def test_a_busy_node_has_its_share(cell: Cell, project: Project) -> None:
     flow = project.write("dataflow.yml", ALONE)
     project.write("sink.py", SPIN)
-    cell.start(flow, "--node-limit=sink:cpu=0.4", "--grace-duration=1s")
+    cell.start(flow, "--node=sink:cpu_limit=0.4", "--grace-duration=1s")
     wait_for("it spins", lambda: cell.messages("sink"), 60)
     shares: list[float] = []
 

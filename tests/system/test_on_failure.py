@@ -99,7 +99,7 @@ def ends(cell: Cell) -> None:
 @pytest.mark.warns(*FAILS)
 def test_a_dataflow_fails(cell: Cell, project: Project) -> None:
     """The command gets why as its standard input, as the user of the nodes, once."""
-    cell.start(flow(project), "--node-rights=source:essential", *options(project))
+    cell.start(flow(project), "--node=source:essential=yes", *options(project))
     project.write("crash", "")
     (text,) = wait_for("the notice", lambda: notices(project))
     found = lines(text)
@@ -146,7 +146,7 @@ def test_a_storm_is_few_notices(cell: Cell, project: Project) -> None:
     policy = ["--restart-policy=on-failure", "--max-restarts=infinity"]
     policy += ["--restart-delay=500ms", "--max-restart-delay=500ms"]
     path = flow(project)
-    cell.start(path, "--node-rights=source:essential", *policy, *options(project))
+    cell.start(path, "--node=source:essential=yes", *policy, *options(project))
     began = time.monotonic()
     project.write("crash", "")
     wait_for("two notices", lambda: len(notices(project)) == 2, 60)

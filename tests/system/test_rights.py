@@ -70,9 +70,9 @@ def hard_limit(pid: int, name: str) -> str:
 def test_rights_of_one_node_and_of_the_others(cell: Cell, project: Project) -> None:
     cell.start(
         project.three_nodes(),
-        "--node-rights=sink:nice=5,scheduling=batch,oom-score-adjust=300,lock-memory=no",
-        "--node-rights=source:essential",
-        f"--node-limit=source:cpus={LAST}",
+        "--node=sink:nice=5,scheduling=batch,oom_score_adjust=300,lock_memory=no",
+        "--node=source:essential=yes",
+        f"--node=source:cpus={LAST}",
         "--nice=2",
     )
     cell.wait_exchanging()
@@ -108,7 +108,13 @@ def test_a_node_without_core_dumps(cell: Cell, project: Project) -> None:
     assert limits == {"sink": "0", "source": others, "doubler": others}
 
 
-RAISING = ("scheduling=fifo:5", "scheduling=rr:7", "nice=-5", "oom-score-adjust=-50", "lock-memory")
+RAISING = (
+    "scheduling=fifo:5",
+    "scheduling=rr:7",
+    "nice=-5",
+    "oom_score_adjust=-50",
+    "lock_memory=yes",
+)
 
 
 @pytest.mark.warns(*IN_THE_JOURNAL, *FAILED, "OOM", "oom")
@@ -117,7 +123,7 @@ def test_what_raises_rights_is_granted_to_one_node_or_refused(
     cell: Cell, project: Project, right: str
 ) -> None:
     flow = project.three_nodes()
-    given = f"--node-rights=sink:{right}"
+    given = f"--node=sink:{right}"
     tried = cell.doractl("start", str(flow), "--name", cell.name, given, "--dry-run", check=False)
     done = cell.start(flow, given, check=False)
     assert tried.returncode == done.returncode, (tried.stderr, done.stderr)
@@ -138,8 +144,8 @@ def test_what_raises_rights_is_granted_to_one_node_or_refused(
     found = {
         "scheduling": str(rights_of(sink).priority),
         "nice": str(rights_of(sink).nice),
-        "oom-score-adjust": str(rights_of(sink).oom),
-        "lock-memory": hard_limit(sink, "Max locked memory").replace("unlimited", ""),
+        "oom_score_adjust": str(rights_of(sink).oom),
+        "lock_memory": hard_limit(sink, "Max locked memory").replace("unlimited", "yes"),
     }
     assert found[word] == number
     for pid in others:
@@ -154,14 +160,14 @@ def test_bad_rights(cell: Cell, project: Project) -> None:
     flow = str(project.three_nodes())
     usage, bad = ExitCode.USAGE, ExitCode.BAD_INPUT
     flags = {
-        "--node-rights=sink:scheduling=fifo:100": (usage, "fifo:PRIORITY with 1 to 99"),
-        "--node-rights=sink:scheduling=batsh": (usage, "did you mean batch?"),
-        "--node-rights=sink:nice=-21": (usage, "from -20"),
-        "--node-rights=sink:priority=5": (usage, "valid values: scheduling"),
-        "--node-rights=sink": (usage, "write NODE:"),
-        "--node-rights=snik:nice=5": (bad, "did you mean sink?"),
-        "--node-limit=sink:cpus=-1": (usage, "such as 2-3"),
-        "--node-limit=sink:cpus=8000": (bad, "this machine has none"),
+        "--node=sink:scheduling=fifo:100": (usage, "fifo:PRIORITY with 1 to 99"),
+        "--node=sink:scheduling=batsh": (usage, "did you mean batch?"),
+        "--node=sink:nice=-21": (usage, "from -20"),
+        "--node=sink:priority=5": (usage, "dora-systemd.yml(5)"),
+        "--node=sink": (usage, "write NODE:"),
+        "--node=snik:nice=5": (bad, "did you mean sink?"),
+        "--node=sink:cpus=-1": (usage, "such as 2-3"),
+        "--node=sink:cpus=8000": (bad, "this machine has none"),
     }
     refusals = [Refusal([flow, flag], *expected) for flag, expected in flags.items()]
     check_refusals(cell, project, refusals)
@@ -199,7 +205,7 @@ def test_an_essential_node_ends_the_dataflow(cell: Cell, project: Project, resta
     project.write("other.py", WAITING)
     flow = project.write("dataflow.yml", ESSENTIAL)
     policy = ("--restart-policy=on-failure", f"--max-restarts={restarts}") if restarts else ()
-    cell.start(flow, "--node-rights=bad:essential", *policy)
+    cell.start(flow, "--node=bad:essential=yes", *policy)
     wait_for("it has failed", lambda: cell.show("ActiveState") == "failed", 60)
     reason = "essential node bad: exit code 3" + (" after 1 restart" if restarts else "")
     assert (cell.show("StatusText"), cell.show("NRestarts")) == (f"failed: {reason}", "0")
@@ -218,7 +224,7 @@ def test_a_reload_that_fails_and_leaves_it_down_ends_the_dataflow(
     """Its old version has ended, and the old file is gone: nothing can be started again."""
     bad = project.write("bad.py", WAITING)
     project.write("other.py", WAITING)
-    cell.start(project.write("dataflow.yml", ESSENTIAL), "--node-rights=bad:essential")
+    cell.start(project.write("dataflow.yml", ESSENTIAL), "--node=bad:essential=yes")
     bad.write_text("raise SystemExit(3)\n")
     refused = cell.doractl("reload", cell.name, check=False)
     assert "cannot use what was saved: node bad: exit code 3" in refused.stderr
@@ -239,7 +245,7 @@ def test_a_reload_that_goes_back_keeps_it(cell: Cell, project: Project) -> None:
         project.write(name, WAITING)
     project.write("new.py", "raise SystemExit(3)\n")
     flow = project.write("dataflow.yml", ESSENTIAL)
-    cell.start(flow, "--node-rights=bad:essential")
+    cell.start(flow, "--node=bad:essential=yes")
     flow.write_text(ESSENTIAL.replace("bad.py", "new.py"))
     refused = cell.doractl("reload", cell.name, check=False)
     assert "the previous version is running again" in refused.stderr
@@ -251,7 +257,7 @@ def test_a_reload_that_goes_back_keeps_it(cell: Cell, project: Project) -> None:
 def test_without_it_the_others_stay(cell: Cell, project: Project) -> None:
     project.write("bad.py", CRASHING)
     project.write("other.py", WAITING)
-    cell.start(project.write("dataflow.yml", ESSENTIAL), "--node-rights=other:essential")
+    cell.start(project.write("dataflow.yml", ESSENTIAL), "--node=other:essential=yes")
     wait_for("it has failed", lambda: cell.status.nodes["bad"].state == "failed")
     cell.wait_exchanging("other")
     assert cell.status.stage == "degraded"
@@ -259,9 +265,9 @@ def test_without_it_the_others_stay(cell: Cell, project: Project) -> None:
 
 @pytest.mark.skipif(HAS_CPUSET, reason="the launcher has nothing to do")
 def test_cpus_without_a_controller(cell: Cell, project: Project) -> None:
-    done = cell.start(project.three_nodes(), "--node-limit=sink:cpus=0")
+    done = cell.start(project.three_nodes(), "--node=sink:cpus=0")
     assert "doractl: systemd has no cpuset controller here: sink can leave" in done.stderr
-    changed = cell.doractl("set", cell.name, f"--node-limit=sink:cpus={LAST}", check=False)
+    changed = cell.doractl("set", cell.name, f"--node=sink:cpus={LAST}", check=False)
     assert changed.returncode == ExitCode.NO_SYSTEMD
     assert "cannot enforce cpus of the node sink" in changed.stderr
     assert of_node(cell, "sink").cpus == {0}
@@ -269,14 +275,14 @@ def test_cpus_without_a_controller(cell: Cell, project: Project) -> None:
 
 @pytest.mark.emulator
 def test_cpus_of_a_running_node(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes(), "--node-limit=sink:cpus=0")
+    cell.start(project.three_nodes(), "--node=sink:cpus=0")
     files = cell.group / "node-sink"
     assert (files / "cpuset.cpus.effective").read_text() == "0\n"
-    cell.doractl("set", cell.name, f"--node-limit=sink:cpus={LAST}")
+    cell.doractl("set", cell.name, f"--node=sink:cpus={LAST}")
     assert of_node(cell, "sink").cpus == {LAST}
-    refused = cell.doractl("set", cell.name, "--node-limit=sink:cpus=8000", check=False)
+    refused = cell.doractl("set", cell.name, "--node=sink:cpus=8000", check=False)
     assert refused.returncode == ExitCode.BAD_INPUT
-    cell.doractl("set", cell.name, "--node-limit=sink:cpus=infinity")
+    cell.doractl("set", cell.name, "--node=sink:cpus=infinity")
     assert of_node(cell, "sink").cpus == frozenset(os.sched_getaffinity(0))
 
 

@@ -190,15 +190,15 @@ def test_nothing_is_left_of_a_node_that_is_not_restarted(cell: Cell, project: Pr
 BAD = {
     "--watchdog=5": ExitCode.USAGE,
     "--watchdog=-1s": ExitCode.USAGE,
-    "--watchdog=feeder=10ms": ExitCode.USAGE,
+    "--node=feeder:watchdog=10ms": ExitCode.USAGE,
     "--watchdog=soon": ExitCode.USAGE,
-    "--watchdog=feder=5s": ExitCode.BAD_INPUT,
+    "--node=feder:watchdog=5s": ExitCode.BAD_INPUT,
 }
 
 
 def test_bad_watchdogs(cell: Cell, project: Project) -> None:
     flow = write_flow(project, feeder=FEEDER)
-    parts = {ExitCode.USAGE: "--watchdog", ExitCode.BAD_INPUT: "did you mean feeder?"}
+    parts = {ExitCode.USAGE: "watchdog", ExitCode.BAD_INPUT: "did you mean feeder?"}
     check_refusals(cell, project, [Refusal([flow, one], BAD[one], parts[BAD[one]]) for one in BAD])
 
 

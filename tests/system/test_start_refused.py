@@ -88,7 +88,7 @@ BAD_OPTIONS = {
     "--env-file=/": ExitCode.BAD_INPUT,
     "--grace-duration=soon": ExitCode.USAGE,
     "--log-rate-limit=fast": ExitCode.USAGE,
-    "--log-rate-limit=sorce=5/1s": ExitCode.BAD_INPUT,
+    "--node=sorce:log_rate_limit=5/1s": ExitCode.BAD_INPUT,
     "--property=Nice": ExitCode.USAGE,
     "--property=Nice=50": ExitCode.USAGE,
     "--property=ExecStart=/bin/true": ExitCode.USAGE,

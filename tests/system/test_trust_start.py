@@ -51,7 +51,7 @@ def test_her_dora_never_runs_as_root(cell: Cell, mallory: Home) -> None:
     try:
         cell.start(flow, "--dry-run")
         cell.start(flow)
-        cell.doractl("set", cell.name, "--node-limit", "m.a:tasks=500", check=False)
+        cell.doractl("set", cell.name, "--node", "m.a:tasks_limit=500", check=False)
         cell.doractl("dora", cell.name, "list")
         cell.doractl("stop", cell.name)
     finally:

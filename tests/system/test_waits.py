@@ -66,7 +66,7 @@ def device(project: Project) -> Iterator[tuple[Path, int]]:
 def test_a_busy_process_on_the_cpu_of_a_node(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     project.write("sink.py", BUSY)
-    cell.start(flow, f"--node-limit=sink:cpus={LAST}")
+    cell.start(flow, f"--node=sink:cpus={LAST}")
 
     remedies: list[str] = []
 
@@ -90,7 +90,7 @@ def test_interrupts_of_a_needed_device(
     cell: Cell, project: Project, device: tuple[Path, int]
 ) -> None:
     path, cpu = device
-    cell.start(project.three_nodes(), f"--needs=sink={path}", f"--node-limit=sink:cpus={cpu}")
+    cell.start(project.three_nodes(), f"--node=sink:needs={path},cpus={cpu}")
     wait_for("messages", lambda: cell.messages("sink"))
     found = json.loads(run("doractl", cell.scope.flag, "doctor", "-o", "json", check=False).stdout)
     (one,) = [one for one in found if one["topic"] == "interrupts"]

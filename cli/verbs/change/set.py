@@ -46,9 +46,9 @@ def command(
 
     Examples:
       doractl set robot --memory-limit 6G
-      doractl set robot --node-limit detector:memory=2G,cpu=1.5
+      doractl set robot --node detector:memory_limit=2G,cpu_limit=1.5
       doractl set robot --cpu-limit infinity
-      doractl set robot --log-rate-limit camera=10/1s
+      doractl set robot --node camera:log_rate_limit=10/1s
       doractl set robot --hot-reload on
       doractl set robot --record off
     """

@@ -157,8 +157,7 @@ def watchdogs_of(options: RunnerOptions) -> Watchdogs:
     """Which nodes have one: none of those of other machines. Raises DoraSystemdError."""
     if not any(map(options.has, ("watchdog", "notify", "stop"))):
         return {}
-    limits = dict(options.of_dataflow("watchdog"))
-    limits |= {node: own[ALL_NODES] for node, own in options.by_node("watchdog").items()}
+    limits = {ALL_NODES: options.of_dataflow("watchdog"), **options.by_node("watchdog")}
     # A node with a time to stop can extend it.
     timed = {node: True for node, one in options.by_node("stop").items() if one.within}
     sockets = {ALL_NODES: options.of_dataflow("notify"), **timed, **options.by_node("notify")}

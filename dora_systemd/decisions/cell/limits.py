@@ -98,8 +98,7 @@ def _weight_file(weight: int) -> str:
 class Limit(NamedTuple):
     """A resource that can be limited, for a dataflow and for a node."""
 
-    word: str  # its name in `--node-limit NODE:WORD=VALUE`
-    key: str  # the setting, in settings files
+    key: str  # the setting
     property: str  # of the unit, see systemd.resource-control(5)
     file: str  # the control file of cgroup v2
     parse: Callable[[str], int]  # text to value
@@ -112,34 +111,33 @@ class Limit(NamedTuple):
 
 
 LIMITS = (
-    Limit("cpu", "cpu_limit", "CPUQuota", "cpu.max", parse_share, format_cpu, _quota_file),
-    Limit("memory", "memory_limit", "MemoryMax", "memory.max", parse_memory, format_size),
-    Limit("memory-high", "memory_high", "MemoryHigh", "memory.high", parse_memory, format_size),
+    Limit("cpu_limit", "CPUQuota", "cpu.max", parse_share, format_cpu, _quota_file),
+    Limit("memory_limit", "MemoryMax", "memory.max", parse_memory, format_size),
+    Limit("memory_high", "MemoryHigh", "memory.high", parse_memory, format_size),
     # A limit of 0 is useful for swap, unlike for memory.
-    Limit("swap", "swap_limit", "MemorySwapMax", "memory.swap.max", parse_size, format_size),
-    Limit("tasks", "tasks_limit", "TasksMax", "pids.max", parse_tasks),
-    Limit("cpu-weight", "cpu_weight", "CPUWeight", "cpu.weight", parse_weight),
-    Limit("io-weight", "io_weight", "IOWeight", "io.weight", parse_weight, file_text=_weight_file),
-    Limit(CPUS, "cpus", "AllowedCPUs", "cpuset.cpus", parse_cpus, format_cpus, cpus_file),
+    Limit("swap_limit", "MemorySwapMax", "memory.swap.max", parse_size, format_size),
+    Limit("tasks_limit", "TasksMax", "pids.max", parse_tasks),
+    Limit("cpu_weight", "CPUWeight", "cpu.weight", parse_weight),
+    Limit("io_weight", "IOWeight", "io.weight", parse_weight, file_text=_weight_file),
+    Limit(CPUS, "AllowedCPUs", "cpuset.cpus", parse_cpus, format_cpus, cpus_file),
 )
-BY_WORD: Mapping[str, Limit] = {limit.word: limit for limit in LIMITS}
 BY_KEY: Mapping[str, Limit] = {limit.key: limit for limit in LIMITS}
 
 
 class NodeLimits(NamedTuple):
-    """The limits of one node: pairs of a word of LIMITS and its value, in the order of LIMITS."""
+    """The limits of one node: pairs of a key of LIMITS and its value, in their order."""
 
     node: str
     limits: tuple[tuple[str, int], ...]
 
     def files(self) -> dict[str, str]:
         """The text for each control file of the node's group."""
-        return {BY_WORD[word].file: BY_WORD[word].file_text(value) for word, value in self.limits}
+        return {BY_KEY[key].file: BY_KEY[key].file_text(value) for key, value in self.limits}
 
 
 def node_limits(node: str, limits: Mapping[str, int]) -> NodeLimits:
-    """The limits of `node`, by word."""
-    return NodeLimits(node, tuple((word, limits[word]) for word in BY_WORD if word in limits))
+    """The limits of `node`, by key."""
+    return NodeLimits(node, tuple((key, limits[key]) for key in BY_KEY if key in limits))
 
 
 def has_cpus(limits: NodeLimits) -> bool:
@@ -153,37 +151,13 @@ def without_cpus(limits: NodeLimits) -> NodeLimits:
     return limits._replace(limits=kept)
 
 
-def parse_node_limits(text: str) -> NodeLimits:
-    """The limits in NODE:WORD=VALUE,WORD=VALUE. Raises DoraSystemdError (USAGE)."""
-    # Imported late: most dataflows limit no node.
-    from dora_systemd.node_words import NodeWords, parse_node_words
-
-    about = NodeWords("a limit", "limits", "memory=1G,cpu=1.5")
-    return node_limits(*parse_node_words(text, about, {one.word: one.parse for one in LIMITS}))
-
-
-def format_node_limits(limits: NodeLimits) -> str:
-    """The exact inverse of parse_node_limits."""
-    pairs = (f"{word}={BY_WORD[word].format(value)}" for word, value in limits.limits)
-    return f"{limits.node}:{','.join(pairs)}"
-
-
-def merge_node_limits(*sources: Iterable[NodeLimits]) -> tuple[NodeLimits, ...]:
-    """The limits of several sources; later ones take precedence."""
-    merged: dict[str, dict[str, int]] = {}
-    for source in sources:
-        for one in source:
-            merged.setdefault(one.node, {}).update(one.limits)
-    return tuple(node_limits(node, limits) for node, limits in merged.items() if limits)
-
-
 @lru_cache(maxsize=4)
 def limits_of(options: "RunnerOptions") -> tuple[NodeLimits, ...]:
     """The limits of single nodes. Raises DoraSystemdError."""
     named = dict.fromkeys(one.node for one in options.settings if one.node and one.key in BY_KEY)
-    found = {one.word: options.by_node(one.key) for one in LIMITS} if named else {}
+    found = {key: options.by_node(key) for key in BY_KEY} if named else {}
     return tuple(
-        node_limits(node, {word: own[node] for word, own in found.items() if node in own})
+        node_limits(node, {key: own[node] for key, own in found.items() if node in own})
         for node in named
     )
 

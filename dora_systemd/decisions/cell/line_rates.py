@@ -3,7 +3,7 @@
 The default is no limit, because a limit drops lines, even though it counts them.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -56,20 +56,6 @@ def format_rate(limit: RateLimit | None) -> str:
     return f"{limit.lines}/{format_duration(limit.interval)}"
 
 
-def parse_rates(texts: Iterable[str]) -> dict[str, RateLimit | None]:
-    """Limits by node from "1000/1s" and "NODE=100/1s"; raises DoraSystemdError (USAGE)."""
-    parts = (text.rpartition("=")[::2] for text in texts)
-    return {node.strip(): parse_rate(limit) for node, limit in parts}
-
-
-def format_rates(limits: RateLimits) -> list[str]:
-    """The texts from which parse_rates makes `limits`."""
-    return [
-        f"{node}={format_rate(limit)}" if node else format_rate(limit)
-        for node, limit in limits.items()
-    ]
-
-
 _KEY = "log_rate_limit"
 
 
@@ -77,8 +63,8 @@ def rates_of(options: RunnerOptions) -> RateLimits:
     """The limits of the dataflow and of single nodes. Raises DoraSystemdError."""
     if not options.has(_KEY):
         return UNLIMITED
-    own = {node: limits[ALL_NODES] for node, limits in options.by_node(_KEY).items()}
-    return {**options.of_dataflow(_KEY), **own}
+    of_all = options.of_dataflow(_KEY)
+    return {**({ALL_NODES: of_all} if of_all else {}), **options.by_node(_KEY)}
 
 
 def rate_texts(limits: RateLimits) -> list[SettingText]:

@@ -1,18 +1,18 @@
 """What a dataflow and its nodes need before they start: the words of the setting `needs`.
 
 A dataflow needs units, and systemd waits for them. A node needs paths and network interfaces, and
-the runner waits for them. `NODE=PATH` is the need of a node where no key names the node: in a flag.
+the runner waits for them.
 """
 
 import re
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Sequence
 from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import did_you_mean, is_name, is_node_id
+from dora_systemd.names import did_you_mean, is_name
 from dora_systemd.values import quoted
 
 NETWORK, CLOCK = "network", "clock"
@@ -39,7 +39,28 @@ class NodeNeed(NamedTuple):
 
 
 def parse_needs(texts: Sequence[str]) -> tuple[str, ...]:
-    """The needs in their shortest form, each once. Raises DoraSystemdError (USAGE)."""
+    """Parse what a dataflow needs: each once, in its shortest form.
+
+    Raises DoraSystemdError (USAGE).
+    """
+    needs = _parse_all(texts)
+    if lonely := next((one for one in needs if one.startswith(_OF_NODES)), None):
+        kind = "a network interface" if lonely.startswith(NET) else "a path"
+        hint = f"write nodes: NODE: needs: {lonely}, or --node NODE:needs={lonely}"
+        raise _refusal(lonely, hint, f": {kind} is what a node needs")
+    return needs
+
+
+def parse_node_needs(texts: Sequence[str]) -> tuple[str, ...]:
+    """The needs of a node in their shortest form, each once. Raises DoraSystemdError (USAGE)."""
+    needs = _parse_all(texts)
+    if wrong := next((one for one in needs if not one.startswith(_OF_NODES)), None):
+        hint = f"write needs: {wrong} outside of nodes:, for the whole dataflow, or --needs {wrong}"
+        raise _refusal(wrong, hint, ": a node needs paths and net:INTERFACE")
+    return needs
+
+
+def _parse_all(texts: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(_parse_need(text.strip()) for text in texts))
 
 
@@ -49,13 +70,8 @@ def _parse_need(text: str) -> str:
     kind, colon, value = text.partition(":")
     if colon and kind in _PARSERS:
         return f"{kind}:{_PARSERS[kind](value, text)}"
-    node, equals, what = text.partition("=")
     if text.startswith("/"):
         return _parse_path(text, text)
-    if equals and is_node_id(node) and what.startswith("/"):
-        return f"{node}={_parse_path(what, text)}"
-    if equals and is_node_id(node) and what.startswith(NET):
-        return f"{node}={NET}{_parse_interface(what.removeprefix(NET), text)}"
     raise _refusal(text, did_you_mean(text, WORDS) or _HINT)
 
 
@@ -94,48 +110,8 @@ _PARSERS = {
 }
 
 
-def _refusal(text: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot wait for {quoted(text)}", hint, ExitCode.USAGE)
-
-
-def needs_by_node(
-    given: tuple[str, ...], by_node: Mapping[str, tuple[str, ...]]
-) -> dict[str, tuple[str, ...]]:
-    """The needs of each node.
-
-    given: of the dataflow, and with a node in front. by_node: from `nodes:` in settings files.
-    Raises DoraSystemdError (BAD_INPUT) for a path or an interface that the dataflow needs, and for
-    a unit that a node needs.
-    """
-    if lonely := next((one for one in given if one.startswith(_OF_NODES)), None):
-        kind = "a network interface" if lonely.startswith(NET) else "a path"
-        raise DoraSystemdError(
-            f"cannot wait for {quoted(lonely)}: {kind} is what a node needs",
-            f"write nodes: NODE: needs: {lonely}, or --needs NODE={lonely}",
-            ExitCode.BAD_INPUT,
-        )
-    for node, texts in by_node.items():
-        _check_of_node(node, texts)
-    found = dict(by_node)
-    for node, what in (one.split("=", 1) for one in given if _is_of_node(one)):
-        found[node] = tuple(dict.fromkeys((*found.get(node, ()), what)))
-    return found
-
-
-def _is_of_node(need: str) -> bool:
-    node, equals, what = need.partition("=")
-    return bool(equals) and is_node_id(node) and what.startswith(_OF_NODES)
-
-
-def _check_of_node(node: str, needs: Sequence[str]) -> None:
-    if wrong := next((one for one in needs if not one.startswith(_OF_NODES)), None):
-        raise DoraSystemdError(
-            f"node {node} cannot wait for {quoted(wrong)}: a node needs paths and net:INTERFACE",
-            f"write needs: {wrong} outside of nodes:, for the whole dataflow"
-            if not _is_of_node(wrong)
-            else f"write {wrong.partition('=')[2]} alone",
-            ExitCode.BAD_INPUT,
-        )
+def _refusal(text: str, hint: str, reason: str = "") -> DoraSystemdError:
+    return DoraSystemdError(f"cannot wait for {quoted(text)}{reason}", hint, ExitCode.USAGE)
 
 
 @lru_cache(maxsize=4)

@@ -40,7 +40,7 @@ MODULES = {
     "ignore": "reload",
     "io_weight": "limits",
     "lock_memory": "rights",
-    "log_rate_limit": "log_rates",
+    "log_rate_limit": "limits",
     "max_restart_delay": "restarts",
     "max_restarts": "restarts",
     "memory_high": "limits",

@@ -34,7 +34,7 @@ SHORTEST = SECOND // 5
 FIRST = 30 * SECOND
 """µs; the default of `first`, unless `within` is longer."""
 
-_FORM = "NODE/OUTPUT:within=TIME,first=TIME,then=restart|warn|fail"
+_FORM = "OUTPUT:within=TIME,first=TIME,then=restart|warn|fail"
 _HINT = f"write {_FORM}; within is required"
 
 
@@ -58,21 +58,20 @@ def parse_owed(text: str) -> Owed:
 
     Raises DoraSystemdError (USAGE).
     """
-    place, colon, rest = text.rpartition(":")
-    node, _, output = place.strip().partition("/")
+    output, colon, rest = text.rpartition(":")
     pairs = [part.partition("=") for part in rest.split(",")]
-    if not (colon and node and output and all(equals for _, equals, _ in pairs)):
+    if not (colon and output and all(equals for _, equals, _ in pairs)):
         raise _wrong(f"{quoted(text)} is none", _HINT)
-    return owed_of({"output": output, **{key.strip(): value for key, _, value in pairs}}, node)
+    return owed_of({"output": output, **{key.strip(): value for key, _, value in pairs}})
 
 
 def format_owed(owed: Owed) -> str:
-    """Format for the runner's command line: `camera/image:within=2s,first=30s,then=restart`."""
+    """Format without the node: `image:within=2s,first=30s,then=restart`."""
     within, first = format_duration(owed.within), format_duration(owed.first)
-    return f"{owed.place}:within={within},first={first},then={owed.then}"
+    return f"{owed.output}:within={within},first={first},then={owed.then}"
 
 
-def owed_of(values: Mapping[str, str], node: str = "") -> Owed:
+def owed_of(values: Mapping[str, str]) -> Owed:
     """The output from its KEYS as texts. Raises DoraSystemdError (USAGE)."""
     for key in values:
         if key not in KEYS:
@@ -88,7 +87,7 @@ def owed_of(values: Mapping[str, str], node: str = "") -> Owed:
         raise _wrong(f"unknown action {quoted(then)}", hint)
     within = _time("within", values["within"])
     first = _time("first", values["first"]) if "first" in values else max(FIRST, within)
-    return Owed(node, output, within, first, then)
+    return Owed("", output, within, first, then)
 
 
 def _time(key: str, text: str) -> int:
@@ -107,9 +106,9 @@ def _wrong(reason: str, hint: str) -> DoraSystemdError:
     return DoraSystemdError(f"cannot read an owed output: {reason}", hint, ExitCode.USAGE)
 
 
-def merge_owed(*given: Iterable[Owed]) -> tuple[Owed, ...]:
-    """Join owed outputs; of several for the same output the last one counts."""
-    return tuple({one.place: one for many in given for one in many}.values())
+def distinct(owes: Iterable[Owed]) -> tuple[Owed, ...]:
+    """The owed outputs of a node; of several for the same output the last one counts."""
+    return tuple({one.output: one for one in owes}.values())
 
 
 @lru_cache(maxsize=4)

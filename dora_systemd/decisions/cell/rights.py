@@ -10,15 +10,13 @@ again, to the value of the unit, which the kernel keeps for all children.
 import re
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache, reduce
-from operator import or_
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean
-from dora_systemd.node_words import NodeWords, parse_node_words, refusal
-from dora_systemd.values import format_bool, parse_bool, quoted
+from dora_systemd.values import quoted
 
 LOWEST_NICE, HIGHEST_NICE = -20, 19
 MOST_OOM = 1000
@@ -26,7 +24,6 @@ MOST_OOM = 1000
 REALTIME = ("fifo", "rr")
 _SHARING = ("batch", "idle", "other")
 _POLICIES = (*(f"{policy}:PRIORITY" for policy in REALTIME), *_SHARING)
-_ABOUT = NodeWords("a right", "rights", "scheduling=fifo:50,nice=-5")
 _PRIORITY = re.compile(r"0*([1-9][0-9]?)")
 _INTEGER = re.compile(r"[-+]?[0-9]{1,4}")
 
@@ -42,7 +39,7 @@ def parse_scheduling(given: str) -> str:
     hint = f"write {policy}:PRIORITY with 1 to 99, such as {policy}:50"
     if policy not in REALTIME:
         hint = did_you_mean(policy, _SHARING) or f"valid values: {', '.join(_POLICIES)}"
-    raise refusal(f"{quoted(given)} as scheduling", hint)
+    raise _refusal(f"{quoted(given)} as scheduling", hint)
 
 
 def parse_nice(given: str) -> int:
@@ -60,13 +57,12 @@ def parse_oom(given: str) -> int:
 def _parse_integer(given: str, lowest: int, highest: int, what: str, hint: str) -> int:
     text = given.strip()
     if not _INTEGER.fullmatch(text) or not lowest <= int(text) <= highest:
-        raise refusal(f"{quoted(given)} as {what}", hint)
+        raise _refusal(f"{quoted(given)} as {what}", hint)
     return int(text)
 
 
-def _parse_yes(text: str) -> bool:
-    """A boolean; the word alone means yes."""
-    return parse_bool(text or "yes")
+def _refusal(what: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot use {what}", hint, ExitCode.USAGE)
 
 
 def is_realtime(scheduling: str) -> bool:
@@ -79,36 +75,20 @@ def is_negative(value: int) -> bool:
     return value < 0
 
 
-def _never(_: object) -> bool:
-    return False
-
-
-class Right(NamedTuple):
-    """One right of a node."""
-
-    word: str  # in `--node-rights NODE:WORD=VALUE`
-    key: str  # the setting, below `nodes: NODE:`
-    # parse, format: text to value and back
-    parse: Callable[[str], Any]
-    format: Callable[[Any], str] = str
-    raises: Callable[[Any], bool] = _never  # whether a value gives the node more than its user has
-
-
-RIGHTS = (
-    Right("scheduling", "scheduling", parse_scheduling, raises=is_realtime),
-    Right("nice", "nice", parse_nice, raises=is_negative),
-    Right("lock-memory", "lock_memory", _parse_yes, format_bool, raises=bool),
-    Right("oom-score-adjust", "oom_score_adjust", parse_oom, raises=is_negative),
-    Right("essential", "essential", _parse_yes, format_bool),
-)
-BY_WORD: Mapping[str, Right] = {right.word: right for right in RIGHTS}
-BY_KEY: Mapping[str, Right] = {right.key: right for right in RIGHTS}
+RAISES: Mapping[str, Callable[[Any], bool]] = {
+    "scheduling": is_realtime,
+    "nice": is_negative,
+    "lock_memory": bool,
+    "oom_score_adjust": is_negative,
+    "essential": lambda _: False,
+}
+"""By key of each right of a node, whether a value gives the node more than its user has."""
 
 
 class NodeRights(NamedTuple):
     """The rights of one node; None: not given, so as the other nodes.
 
-    The fields are the keys of RIGHTS.
+    The fields are the keys of RAISES.
     """
 
     node: str
@@ -127,41 +107,14 @@ class NodeRights(NamedTuple):
 
 def given_rights(rights: NodeRights) -> dict[str, Any]:
     """The values that are given, by key."""
-    return {key: value for key in BY_KEY if (value := getattr(rights, key)) is not None}
-
-
-def raises_rights(rights: NodeRights) -> bool:
-    """Whether only root may give them in system scope."""
-    return any(BY_KEY[key].raises(value) for key, value in given_rights(rights).items())
-
-
-def parse_node_rights(text: str) -> NodeRights:
-    """The rights in NODE:WORD=VALUE,WORD=VALUE. Raises DoraSystemdError (USAGE)."""
-    node, values = parse_node_words(text, _ABOUT, {right.word: right.parse for right in RIGHTS})
-    return NodeRights(node, **{BY_WORD[word].key: value for word, value in values.items()})
-
-
-def format_node_rights(rights: NodeRights) -> str:
-    """The inverse of parse_node_rights, for a node with rights."""
-    given = given_rights(rights).items()
-    pairs = (f"{BY_KEY[key].word}={BY_KEY[key].format(value)}" for key, value in given)
-    return f"{rights.node}:{','.join(pairs)}"
-
-
-def merge_node_rights(*sources: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
-    """The rights of several sources; later ones take precedence."""
-    by_node: dict[str, list[dict[str, Any]]] = {}
-    for source in sources:
-        for one in source:
-            by_node.setdefault(one.node, []).append(given_rights(one))
-    return tuple(NodeRights(node, **reduce(or_, given)) for node, given in by_node.items())
+    return {key: value for key in RAISES if (value := getattr(rights, key)) is not None}
 
 
 @lru_cache(maxsize=4)
 def rights_of(options: RunnerOptions) -> tuple[NodeRights, ...]:
     """The rights of single nodes. Raises DoraSystemdError."""
-    named = dict.fromkeys(one.node for one in options.settings if one.node and one.key in BY_KEY)
-    found = {key: options.by_node(key) for key in BY_KEY} if named else {}
+    named = dict.fromkeys(one.node for one in options.settings if one.node and one.key in RAISES)
+    found = {key: options.by_node(key) for key in RAISES} if named else {}
     return tuple(
         NodeRights(node, **{key: values[node] for key, values in found.items() if node in values})
         for node in named

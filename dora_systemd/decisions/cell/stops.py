@@ -34,20 +34,19 @@ def named_stops(stops: Mapping[str, NodeStop]) -> Stops:
 
 def parse_node_stop(text: str) -> NodeStop:
     """The exact inverse of format_node_stop. Raises DoraSystemdError (USAGE)."""
-    node, _, rest = text.partition(":")
-    pairs = (part.partition("=") for part in rest.split(",") if part)
+    pairs = (part.partition("=") for part in text.split(",") if part)
     values = {key: value for key, _, value in pairs}
-    return stop_of({**values, "after": values.get("after", "").split()}, node)
+    return stop_of({**values, "after": values.get("after", "").split()})
 
 
 def format_node_stop(stop: NodeStop) -> str:
-    """Format for the runner's command line: `recorder:within=1min,after=camera arm`."""
+    """Format without the node: `within=1min,after=camera arm`."""
     within = [f"within={format_duration(stop.within)}"] if stop.within else []
     after = [f"after={' '.join(stop.after)}"] if stop.after else []
-    return f"{stop.node}:{','.join([*within, *after])}"
+    return ",".join([*within, *after])
 
 
-def stop_of(values: Mapping[str, str | Sequence[str]], node: str = "") -> NodeStop:
+def stop_of(values: Mapping[str, str | Sequence[str]]) -> NodeStop:
     """The stop of a node from its KEYS. Raises DoraSystemdError (USAGE)."""
     for key in values:
         if key not in KEYS:
@@ -61,7 +60,7 @@ def stop_of(values: Mapping[str, str | Sequence[str]], node: str = "") -> NodeSt
     if within is None and not names:
         raise _wrong("it has neither within nor after", _HINT)
     time = 0 if within is None else _time(str(within))
-    return NodeStop(node, time, tuple(dict.fromkeys(names)))
+    return NodeStop("", time, tuple(dict.fromkeys(names)))
 
 
 def _time(text: str) -> int:

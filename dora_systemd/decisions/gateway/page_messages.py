@@ -55,16 +55,17 @@ from typing import Any
 
 from dora_systemd.decisions.cell.environment import with_changes
 from dora_systemd.decisions.cell.limits import (
+    BY_KEY,
     LIMITS,
     Limit,
     NodeLimits,
-    format_node_limits,
     limits_of,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.logs.records import Record, record_text
 from dora_systemd.decisions.settings.limits import LIVE_SETTINGS
+from dora_systemd.decisions.settings.nodes import NODES
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, one_line, without_sequences
 from dora_systemd.values import INFINITY, format_moment
@@ -83,7 +84,7 @@ MAX_ITEMS = 100
 _MAX_ASKED = 1000
 """Maximum characters of a text in a request."""
 _TEXTS = ("type", "dataflow", "node", "action", "search", "since", "until", "run", "release")
-_SETTINGS = frozenset({*(one.name for one in LIVE_SETTINGS), HOT_RELOAD})
+_SETTINGS = frozenset({*(one.name for one in LIVE_SETTINGS), NODES, HOT_RELOAD})
 _DEFAULT_PRIORITY = 6
 _PRIORITIES = frozenset(b"%d" % number for number in range(8))
 
@@ -207,11 +208,16 @@ def fact_values(options: RunnerOptions, unit: Mapping[str, Any]) -> dict[str, An
     nodes = map(_finite, limits_of(now))
     return {
         **{one.key: one.format(value) for one, value in limits.items() if _is_set(value)},
-        "node_limit": [format_node_limits(one) for one in nodes if one.limits],
+        NODES: [_limit_text(one) for one in nodes if one.limits],
         "hot_reload": now.hot_reload,
         "sandbox": _level(unit),
         "network": _network(unit),
     }
+
+
+def _limit_text(one: NodeLimits) -> str:
+    pairs = (f"{key}={BY_KEY[key].format(value)}" for key, value in one.limits)
+    return f"{one.node}:{','.join(pairs)}"
 
 
 def _finite(one: NodeLimits) -> NodeLimits:

@@ -18,7 +18,7 @@ from dora_systemd.decisions.machines.address import parse_address
 from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.decisions.settings.credentials import CREDENTIAL_SETTINGS
 from dora_systemd.decisions.settings.kinds import Scalar, Setting, one_text
-from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, NODE_LIMIT
+from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
 from dora_systemd.decisions.settings.machines import HOST, Declared
 from dora_systemd.decisions.settings.resolve import check_document
 from dora_systemd.decisions.settings.sandbox import SANDBOX, WRITABLE
@@ -41,7 +41,7 @@ _OWN = (
 )
 _UNIT: tuple[Setting[Any], ...] = (
     *(ENV, ENV_FILE, VENV, PROPERTY, USER, DORA),
-    *(one for one in LIMIT_SETTINGS if one.flags and one is not NODE_LIMIT),
+    *(one for one in LIMIT_SETTINGS if one.flags),
     *CREDENTIAL_SETTINGS,
     *(SANDBOX, WRITABLE),
 )

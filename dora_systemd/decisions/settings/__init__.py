@@ -1,7 +1,8 @@
 """Settings: one declaration each for flag, key of the file and variable.
 
 A setting is text with a key from the file to the runner, a member, `doractl set` and hot reload.
-Its module reads, checks, merges and formats it.
+Its module reads, checks, merges and formats it. `nodes.py` has those of single nodes, by the same
+keys below `nodes:` of a file and in `--node`.
 
 A new setting that the runner obeys is an assignment in settings/<concern>.py, which is also in the
 RUNNER_SETTINGS there, and a line in MODULES of cell/options.py. A new concern is joined in

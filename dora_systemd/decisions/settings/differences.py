@@ -5,7 +5,7 @@ from typing import Any
 
 from dora_systemd.decisions.cell.limits import BY_KEY
 from dora_systemd.decisions.cell.options import SettingText
-from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.nodes import NODES
 from dora_systemd.decisions.settings.resolve import Settings, runner_texts
 from dora_systemd.decisions.settings.table import ENV, PROPERTY, SETTINGS, WORKING_DIRECTORY
 from dora_systemd.values import INFINITY
@@ -30,7 +30,7 @@ def settings_change(before: Settings, after: Settings) -> tuple[list[SettingText
         for key, _ in _items(before, node) ^ _items(after, node)
         if key not in BY_KEY
     }
-    return limits, sorted(own - {NODE_LIMIT.name}) + sorted(nodes)
+    return limits, sorted(own - {NODES}) + sorted(nodes)
 
 
 def _limits(settings: Settings) -> dict[tuple[str, str], SettingText]:

@@ -1,6 +1,6 @@
 """Defines settings, and the kinds of their values."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import add, or_
 from pathlib import PurePath
@@ -44,6 +44,8 @@ class Kind(Generic[T]):
     # joins the values of two sources, higher precedence last; None: only the latter counts
     merge: Callable[[T, T], T] | None = None
     metavar: str = ""  # the value in --help, such as TIME; a setting may have a better one
+    # the keys, if a value can be a mapping; as text it is KEY=VALUE,KEY=VALUE
+    keys: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,8 @@ class Setting(Generic[T]):
     on_members: bool = True
     # a hot reload may remove a node with a value; a limit could be for a node that was renamed
     outlives_node: bool = False
-    # for a value for the dataflow that names nodes: what the runner gets instead, by node, "" for
-    # the dataflow, and by key. From the values that files give nodes, and the one for the dataflow.
-    by_node: Callable[[Mapping[str, Any], Any], Mapping[str, Mapping[str, Any]]] | None = None
+    # of the values of nodes, if they have another one; then the runner gets only those
+    node_kind: Kind[Any] | None = None
     # makes of a value what the runner gets, when the working directory is known
     at_start: Callable[[Any, str], Any] | None = None
     # raises DoraSystemdError (BAD_INPUT) for values in the options of a runner that these nodes of
@@ -95,9 +96,14 @@ class Setting(Generic[T]):
         object.__setattr__(self, "variable", self.variable or variable)
         object.__setattr__(self, "metavar", self.metavar or self.kind.metavar)
 
+    def of_node(self) -> Kind[Any]:
+        """The kind of the values of nodes."""
+        return self.node_kind or self.kind
+
     def read(self, texts: Sequence[str]) -> T:
         """The value that Kind.format has made `texts` of. Raises DoraSystemdError."""
-        value: T = self.kind.parse(list(texts) if self.kind.is_repeatable else texts[-1], None)
+        kind = self.of_node()
+        value: T = kind.parse(list(texts) if kind.is_repeatable else texts[-1], None)
         return value
 
 
@@ -145,46 +151,6 @@ def many_texts(
         merge=merge,
         metavar=metavar,
     )
-
-
-def texts_of_nodes(
-    example: str,
-    metavar: str,
-    parse: Callable[[str], T],
-    to_text: Callable[[T], str],
-    merge: Callable[[Iterable[T], Iterable[T]], tuple[T, ...]],
-) -> Kind[tuple[T, ...]]:
-    """A repeatable kind of texts about one node each. merge: joins values for the same node."""
-    return Kind(
-        str | list[str],
-        f"{example} or a list of such texts",
-        lambda value, _: merge((), map(parse, texts_of(value))),
-        lambda values: list(map(to_text, values)),
-        is_repeatable=True,
-        merge=merge,
-        metavar=metavar,
-    )
-
-
-def by_named_node(
-    key: str, to_texts: Callable[[Mapping[str, T]], Sequence[str]], hint: str
-) -> Callable[[Mapping[str, Any], Any], dict[str, dict[str, Any]]]:
-    """A Setting.by_node for values that name their nodes, with "" for all nodes.
-
-    A value for the dataflow takes precedence over those that settings files have for nodes.
-    """
-
-    def by_node(
-        nodes: Mapping[str, Mapping[str, T]], given: Mapping[str, T]
-    ) -> dict[str, dict[str, Any]]:
-        for node, own in nodes.items():
-            if named := {one: value for one, value in own.items() if one}:
-                message = f"cannot use {quoted(to_texts(named)[0])} as {key} of node {node}"
-                raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
-        values = {**{node: own[""] for node, own in nodes.items()}, **given}
-        return {node: {key: {"": value}} for node, value in values.items()}
-
-    return by_node
 
 
 def _checked_text(text: str) -> str:

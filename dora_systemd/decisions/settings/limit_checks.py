@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from dora_systemd.decisions.cell.limits import BY_WORD, CPUS, LIMITS, NodeLimits
+from dora_systemd.decisions.cell.limits import BY_KEY, CPUS, LIMITS, NodeLimits
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import (
@@ -25,6 +25,8 @@ _CONTROLLERS = {
 }
 """Keys of a unit that need a controller, see systemd.resource-control(5)."""
 
+_MEMORY = "memory_limit"
+
 
 @dataclass(frozen=True)
 class Machine:
@@ -44,9 +46,9 @@ def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> d
         if slot in _CONTROLLERS and one.value != INFINITY
     }
     for one in nodes:
-        for word, value in one.limits:
+        for key, value in one.limits:
             if value != INFINITY:
-                needed.setdefault(BY_WORD[word].controller(), f"{word} of the node {one.node}")
+                needed.setdefault(BY_KEY[key].controller(), f"{key} of the node {one.node}")
     return needed
 
 
@@ -85,15 +87,15 @@ def check_controllers(needed: Mapping[str, str], available: Collection[str], is_
 def size_warnings(
     limits: Mapping[str, int | None], nodes: Iterable[NodeLimits], machine: Machine
 ) -> tuple[str, ...]:
-    """A warning for each limit above the machine's size. limits: of the dataflow, by word."""
-    own = {word: value for word, value in limits.items() if value is not None}
-    whole: dict[str, int] = {word: own[word] for word in ("memory", "cpu", "tasks") if word in own}
+    """A warning for each limit above the machine's size. limits: of the dataflow, by key."""
+    own = {key: value for key, value in limits.items() if value is not None}
     there = {
-        "memory": machine.memory,
-        "memory-high": machine.memory,
-        "cpu": machine.cores * SECOND,
-        "tasks": machine.tasks,
+        "memory_limit": machine.memory,
+        "memory_high": machine.memory,
+        "cpu_limit": machine.cores * SECOND,
+        "tasks_limit": machine.tasks,
     }
+    whole = {key: own[key] for key in there if key in own and key != "memory_high"}
     found = [*_above("the dataflow", own, there, "this machine has")]
     for one in nodes:
         whose, of_node = f"the node {one.node}", dict(one.limits)
@@ -110,15 +112,15 @@ def check_use(
 ) -> None:
     """Raise DoraSystemdError for the first memory limit below the current usage.
 
-    limits: of the dataflow, by word. whole, held: bytes in use by it and by each node.
+    limits: of the dataflow, by key. whole, held: bytes in use by it and by each node.
     """
-    pairs = [("the dataflow", limits.get("memory"), whole)]
-    pairs += [(f"the node {n.node}", dict(n.limits).get("memory"), held.get(n.node)) for n in nodes]
+    pairs = [("the dataflow", limits.get(_MEMORY), whole)]
+    pairs += [(f"the node {n.node}", dict(n.limits).get(_MEMORY), held.get(n.node)) for n in nodes]
     for whose, limit, used in pairs:
         if limit is not None and used is not None and limit < used:
             raise DoraSystemdError(
-                f"cannot limit the memory of {whose} to {_shown('memory', limit)}: "
-                f"it uses {_shown('memory', used)} now",
+                f"cannot limit the memory of {whose} to {_shown(_MEMORY, limit)}: "
+                f"it uses {_shown(_MEMORY, used)} now",
                 "--force does it; the kernel may kill processes then",
             )
 
@@ -126,14 +128,14 @@ def check_use(
 def _above(
     whose: str, limits: Mapping[str, int], bounds: Mapping[str, int], there: str
 ) -> Iterator[str]:
-    for word, most in bounds.items():
-        value = limits.get(word, 0)
+    for key, most in bounds.items():
+        value = limits.get(key, 0)
         if most < value < INFINITY:
-            limit = f"the limit {word}={_shown(word, value)} of {whose}"
-            yield f"{limit} is more than {there}: {_shown(word, most)}"
+            limit = f"the limit {key}={_shown(key, value)} of {whose}"
+            yield f"{limit} is more than {there}: {_shown(key, most)}"
 
 
-def _shown(word: str, value: int) -> str:
-    if word == "cpu":
+def _shown(key: str, value: int) -> str:
+    if key == "cpu_limit":
         return f"{value / SECOND:g} cores"
-    return str(value) if word == "tasks" else format_rounded_size(value)
+    return str(value) if key == "tasks_limit" else format_rounded_size(value)

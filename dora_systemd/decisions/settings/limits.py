@@ -1,25 +1,20 @@
 """The settings that limit a dataflow or its nodes, see systemd.resource-control(5)."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from operator import add
 from typing import Any
 
 from dora_systemd.decisions.cell.limits import (
     BY_KEY,
-    BY_WORD,
-    LIMITS,
-    NodeLimits,
     check_nodes,
-    format_node_limits,
     limits_of,
-    merge_node_limits,
-    parse_node_limits,
 )
+from dora_systemd.decisions.cell.line_rates import RateLimit, format_rate, parse_rate
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import is_negative, parse_nice
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
-from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text, texts_of_nodes
+from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text
 from dora_systemd.decisions.settings.rights import check_rights
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
@@ -87,23 +82,6 @@ def _check(options: RunnerOptions, nodes: Sequence[Node]) -> None:
     check_nodes(limits_of(options), [node.id for node in nodes], dynamic)
 
 
-def _by_node(_: Mapping[str, Any], given: tuple[NodeLimits, ...]) -> dict[str, dict[str, int]]:
-    return {one.node: {BY_WORD[word].key: value for word, value in one.limits} for one in given}
-
-
-NODE_LIMIT = Setting[tuple[NodeLimits, ...]](
-    "node_limit",
-    texts_of_nodes(
-        "NODE:memory=1G,cpu=1.5",
-        "NODE:LIMIT=VALUE,...",
-        parse_node_limits,
-        format_node_limits,
-        merge_node_limits,
-    ),
-    (),
-    f"Limits of one node: {', '.join(limit.word for limit in LIMITS)}.",
-    by_node=_by_node,
-)
 NICE = Setting[int | None](
     "nice",
     one_text(int | str, "a number from -20 to 19", "N", parse_nice),
@@ -145,12 +123,18 @@ CPUS = Setting[int | None](
     only_nodes=True,
     check=_check,
 )
+LOG_RATE_LIMIT = Setting[RateLimit | None](
+    "log_rate_limit",
+    one_text(str, "LINES/TIME such as 1000/1s", "LINES/TIME", parse_rate, format_rate),
+    None,
+    "Log lines per time to keep of each node; the rest is dropped and counted.",
+    per_node=True,
+)
 LIVE_SETTINGS: tuple[Setting[Any], ...] = (
     *(_limit_setting(key, help_text) for key, help_text in _HELPS.items()),
     CPUS,
-    NODE_LIMIT,
 )
 """Settings that can be changed while the dataflow is running."""
 
 LIMIT_SETTINGS: tuple[Setting[Any], ...] = (*LIVE_SETTINGS, NICE, REALTIME, DEVICE)
-RUNNER_SETTINGS = {one.name: one for one in (*LIVE_SETTINGS, NICE) if one is not NODE_LIMIT}
+RUNNER_SETTINGS = {one.name: one for one in (*LIVE_SETTINGS, NICE, LOG_RATE_LIMIT)}

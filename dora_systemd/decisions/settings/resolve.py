@@ -19,6 +19,7 @@ from dora_systemd.decisions.cell.options import (
 from dora_systemd.decisions.cell.owes import RESTART
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
+from dora_systemd.decisions.settings.nodes import NODES, Nodes
 from dora_systemd.decisions.settings.owes import OWES
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, WATCH
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
@@ -52,7 +53,6 @@ class Settings:
     values: Mapping[str, Any]
     # by name of the setting: a flag, a variable's name, a file's path or DEFAULT_SOURCE
     sources: Mapping[str, str]
-    nodes: Mapping[str, Mapping[str, Any]]  # by node id, the per-node values by name of the setting
     table: Sequence[Setting[Any]] = field(default=SETTINGS, repr=False)  # the existing settings
     # in system scope, environment files that only others than root name
     lent: frozenset[str] = frozenset()
@@ -68,6 +68,11 @@ class Settings:
     def is_given(self, setting: Setting[Any]) -> bool:
         """Whether anything but the default gives a value for `setting`."""
         return self.sources[setting.name] != DEFAULT_SOURCE
+
+    @property
+    def nodes(self) -> Nodes:
+        """The values of single nodes."""
+        return cast(Nodes, self.values.get(NODES, {}))
 
     def by_node(self, setting: Setting[T]) -> dict[str, T]:
         """The values of `setting` for single nodes, by node id."""
@@ -100,8 +105,7 @@ def resolve_settings(
             *_from_flag(setting, flags),
         ]
         sources[setting.name], values[setting.name] = _merged(setting, given)
-    nodes = _resolve_nodes(documents, table)
-    return Settings(values, sources, nodes, table, passed=passed)
+    return Settings(values, sources, table, passed=passed)
 
 
 def given_texts(
@@ -172,23 +176,29 @@ def _from_files(
 ) -> Iterator[Given]:
     for source, document in documents:
         if setting.name in document:
-            yield source, _parsed_in_file(setting, document[setting.name], source, setting.name)
+            yield source, _parsed_in_file(setting, document[setting.name], source)
 
 
-def _parsed_in_file(setting: Setting[Any], value: object, source: str, *place: str) -> Any:
+def _parsed_in_file(setting: Setting[Any], value: object, source: str) -> Any:
     base = PurePath(source).parent
     try:
         return setting.kind.parse(value, base if base.is_absolute() else None)
     except DoraSystemdError as error:
+        place = (setting.name, *_inner(error))
         message = f"{error.message} ({'.'.join(place)} in {shown(source)}"
         raise WrongKey(message, error.hint, source, place, end=")") from error
+
+
+def _inner(error: DoraSystemdError) -> Sequence[str]:
+    return error.place if isinstance(error, WrongKey) else ()
 
 
 def _parsed(setting: Setting[Any], value: object, where: str, base: Base) -> Any:
     try:
         return setting.kind.parse(value, base)
     except DoraSystemdError as error:
-        message = f"{error.message} ({where})"
+        place = " ".join(filter(None, (where, ":".join(_inner(error)))))
+        message = f"{error.message} ({place})"
         raise DoraSystemdError(message, error.hint, ExitCode.USAGE) from error
 
 
@@ -201,20 +211,6 @@ def _merged(setting: Setting[Any], given: Sequence[Given]) -> Given:
         return given[-1]
     names = ", ".join(source for source, _ in reversed(given))
     return names, reduce(merge, (value for _, value in given))
-
-
-def _resolve_nodes(
-    documents: Sequence[tuple[str, Mapping[str, Any]]], table: Sequence[Setting[Any]]
-) -> dict[str, dict[str, Any]]:
-    """The per-node values of all files; `documents` has the highest precedence first."""
-    settings = {setting.name: setting for setting in table if setting.per_node}
-    nodes: dict[str, dict[str, Any]] = {}
-    for source, document in reversed(documents):
-        for node, values in document.get("nodes", {}).items():
-            for name, value in (values or {}).items():
-                parsed = _parsed_in_file(settings[name], value, source, "nodes", node, name)
-                nodes.setdefault(node, {})[name] = parsed
-    return nodes
 
 
 def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
@@ -236,33 +232,25 @@ def runner_texts(settings: Settings, directory: str | None = None) -> Iterator[S
     directory: the working directory, None as long as nothing starts. Raises DoraSystemdError.
     """
     table = {setting.name: setting for setting in settings.table}
-    for node, values in _by_node(settings).items():
+    of_all = {one.name: settings[one] for one in settings.table if _is_passed(one, settings)}
+    for node, values in {"": of_all, **settings.nodes}.items():
         for key, value in values.items():
             setting = table[key]
             if setting.at_start and directory is not None:
                 value = setting.at_start(value, directory)
-            yield from (SettingText(node, key, text) for text in setting.kind.format(value))
+            yield from (SettingText(node, key, text) for text in setting.of_node().format(value))
 
 
-def _by_node(settings: Settings) -> dict[str, dict[str, Any]]:
-    """The values for the runner by node, "" for the dataflow, and by name of the setting."""
-    found: dict[str, dict[str, Any]] = {"": {}}
-    for node, values in settings.nodes.items():
-        found[node] = {key: value for key, value in values.items() if key in MODULES}
-    for setting in settings.table:
-        if setting.by_node:
-            given = setting.by_node(settings.by_node(setting), settings[setting])
-            for node, own in given.items():
-                found.setdefault(node, {}).update(own)
-        elif setting.name in MODULES and not setting.property and settings.is_given(setting):
-            found[""][setting.name] = settings[setting]
-    return found
+def _is_passed(setting: Setting[Any], settings: Settings) -> bool:
+    """Whether the runner gets the value for the dataflow, because the unit does not have it."""
+    is_in_unit = setting.property or setting.node_kind
+    return setting.name in MODULES and not is_in_unit and settings.is_given(setting)
 
 
 def idle_warnings(settings: Settings) -> Iterator[str]:
     """A warning for each setting that has no effect without another one."""
     policies = {settings[RESTART_POLICY], *settings.by_node(RESTART_POLICY).values()}
-    owes = (settings[OWES], *settings.by_node(OWES).values())
+    owes = settings.by_node(OWES).values()
     policies |= {"on-failure" for one in owes for owed in one if owed.then == RESTART}
     idle: list[tuple[Setting[Any], Setting[Any]]]
     idle = [(one, RESTART_POLICY) for one in POLICY_SETTINGS[1:] if policies == {"no"}]

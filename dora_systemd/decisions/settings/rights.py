@@ -1,25 +1,20 @@
 """The settings of rights that single nodes have, see dora_systemd.decisions.cell.rights."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from dora_systemd.decisions.cell.launch import has_launcher
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import (
-    BY_KEY,
-    RIGHTS,
-    NodeRights,
+    RAISES,
     check_launched,
     check_rights_nodes,
-    format_node_rights,
-    given_rights,
-    merge_node_rights,
-    parse_node_rights,
-    raises_rights,
+    parse_oom,
+    parse_scheduling,
     rights_of,
 )
 from dora_systemd.decisions.descriptor.nodes import Node
-from dora_systemd.decisions.settings.kinds import BOOL, Kind, Setting, one_text, texts_of_nodes
+from dora_systemd.decisions.settings.kinds import BOOL, Kind, Setting, one_text
 
 
 def check_rights(options: RunnerOptions, nodes: Sequence[Node]) -> None:
@@ -38,33 +33,15 @@ def _of_node(
     return Setting(
         *(key, kind, default, help_text),
         only_nodes=True,
-        raises=BY_KEY[key].raises,
+        raises=RAISES[key],
         on_head=on_head,
         check=check_rights,
     )
 
 
-def _by_node(_: Mapping[str, Any], given: tuple[NodeRights, ...]) -> dict[str, dict[str, Any]]:
-    return {one.node: given_rights(one) for one in given}
-
-
-NODE_RIGHTS = Setting[tuple[NodeRights, ...]](
-    "node_rights",
-    texts_of_nodes(
-        "NODE:scheduling=fifo:50,nice=-5",
-        "NODE:RIGHT=VALUE,...",
-        parse_node_rights,
-        format_node_rights,
-        merge_node_rights,
-    ),
-    (),
-    f"Rights of one node: {', '.join(right.word for right in RIGHTS)}.",
-    raises=lambda rights: any(map(raises_rights, rights)),
-    by_node=_by_node,
-)
 SCHEDULING: Setting[str | None] = _of_node(
     "scheduling",
-    one_text(str, "a policy such as fifo:50 or batch", "POLICY", BY_KEY["scheduling"].parse),
+    one_text(str, "a policy such as fifo:50 or batch", "POLICY", parse_scheduling),
     "Scheduling of the node: fifo:PRIORITY, rr:PRIORITY, batch, idle or other; see sched(7).",
 )
 LOCK_MEMORY: Setting[bool] = _of_node(
@@ -72,7 +49,7 @@ LOCK_MEMORY: Setting[bool] = _of_node(
 )
 OOM_SCORE_ADJUST: Setting[int | None] = _of_node(
     "oom_score_adjust",
-    one_text(int | str, "a number from -1000 to 1000", "N", BY_KEY["oom_score_adjust"].parse),
+    one_text(int | str, "a number from -1000 to 1000", "N", parse_oom),
     "How soon the kernel kills the node when memory is short, -1000 to 1000.",
 )
 ESSENTIAL: Setting[bool] = _of_node(
@@ -91,6 +68,6 @@ CORE_DUMPS = Setting[bool](
     check=_check_core_dumps,
 )
 RIGHTS_SETTINGS: tuple[Setting[Any], ...] = (
-    *(NODE_RIGHTS, SCHEDULING, LOCK_MEMORY, OOM_SCORE_ADJUST, ESSENTIAL, CORE_DUMPS),
+    *(SCHEDULING, LOCK_MEMORY, OOM_SCORE_ADJUST, ESSENTIAL, CORE_DUMPS),
 )
-RUNNER_SETTINGS = {one.name: one for one in RIGHTS_SETTINGS[1:]}
+RUNNER_SETTINGS = {one.name: one for one in RIGHTS_SETTINGS}

@@ -19,12 +19,10 @@ from pydantic import (
 
 from dora_systemd.decisions.descriptor.json_size import refusal
 from dora_systemd.decisions.settings.kinds import Setting
+from dora_systemd.decisions.settings.nodes import NODES
 from dora_systemd.errors import DoraSystemdError, WrongKey
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import quoted
-
-NODES = "nodes"
-"""The key of per-node settings in a settings file: `nodes: NODE: KEY: VALUE`."""
 
 # strict: pydantic must not convert between lists, texts and booleans; the kinds parse texts.
 # Debian 12 and Ubuntu 24.04 have pydantic 1.10, which has strict types but no strict models.
@@ -46,7 +44,8 @@ def validate_settings(document: object, table: Sequence[Setting[Any]]) -> None:
 
 def settings_model(table: Sequence[Setting[Any]]) -> type[BaseModel]:
     """The model of a settings file: every key is optional, unknown keys are errors."""
-    fields = _fields([setting for setting in table if not setting.only_nodes])
+    general = (one for one in table if not one.only_nodes and one.name != NODES)
+    fields = _fields(tuple(general))
     of_nodes = [setting for setting in table if setting.per_node]
     if of_nodes:
         node = create_model("NodeSettings", __config__=_CONFIG, **_fields(of_nodes))

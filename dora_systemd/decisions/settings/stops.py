@@ -6,6 +6,7 @@ from typing import Any
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.stops import (
+    KEYS,
     NodeStop,
     check_stops,
     format_node_stop,
@@ -25,7 +26,7 @@ DEFAULT_STOP_LIMIT = 300 * SECOND
 def _parse(value: Any, _: Base) -> NodeStop:
     if not isinstance(value, Mapping):
         text = scalar_text(value)
-        return parse_node_stop(f":{text}" if "=" in text else f":within={text}")
+        return parse_node_stop(text if "=" in text else f"within={text}")
     return stop_of(
         {key: texts_of(one) if key == "after" else scalar_text(one) for key, one in value.items()}
     )
@@ -43,7 +44,8 @@ STOP = Setting[NodeStop | None](
         Scalar | dict[str, Scalar | list[str]],
         "{within: 60s, after: [NODE, ...]}, or one of the two",
         _parse,
-        lambda stop: [format_node_stop(stop).removeprefix(":")],
+        lambda stop: [format_node_stop(stop)],
+        keys=KEYS,
     ),
     None,
     "Time that the node has to stop, and the nodes that stop before it.",

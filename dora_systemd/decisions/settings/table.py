@@ -20,10 +20,10 @@ from dora_systemd.decisions.settings.kinds import (
     TEXT,
     Setting,
 )
-from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, LIVE_SETTINGS
-from dora_systemd.decisions.settings.log_rates import LOG_RATE_LIMIT
+from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, LIVE_SETTINGS, LOG_RATE_LIMIT
 from dora_systemd.decisions.settings.machines import MACHINE_SETTINGS
 from dora_systemd.decisions.settings.needs import NEED_SETTINGS
+from dora_systemd.decisions.settings.nodes import nodes_setting
 from dora_systemd.decisions.settings.on_failure import NOTICE_SETTINGS
 from dora_systemd.decisions.settings.owes import OWES_SETTINGS, SIGN_SETTINGS
 from dora_systemd.decisions.settings.record import RECORD_SETTINGS
@@ -88,10 +88,11 @@ EXIT_WHEN_NODES_FINISH = Setting[bool | None](
 )
 DORA = Setting[str]("dora", PROGRAM, "dora", "The dora program to run.", variable="DORA_PROGRAM")
 
-CHANGEABLE: tuple[Setting[Any], ...] = (*LIVE_SETTINGS, LOG_RATE_LIMIT)
+_LIVE = (*LIVE_SETTINGS, LOG_RATE_LIMIT)
+CHANGEABLE: tuple[Setting[Any], ...] = (*_LIVE, nodes_setting(_LIVE))
 """Settings that `doractl set` changes while the dataflow is running."""
 
-SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
+_SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     # All settings above, in this order, so that a setting is declared in one place only.
     "Nodes": (
         *(
@@ -114,6 +115,8 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     "Hot reload": RELOAD_SETTINGS,
     "Machines": MACHINE_SETTINGS,
 }
+NODES = nodes_setting(setting for section in _SECTIONS.values() for setting in section)
+SECTIONS = {**_SECTIONS, "Nodes": (*_SECTIONS["Nodes"], NODES)}
 """All settings by concern, as --help shows them."""
 
 SETTINGS = tuple(setting for section in SECTIONS.values() for setting in section)

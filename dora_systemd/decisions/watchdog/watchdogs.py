@@ -3,10 +3,10 @@
 The terms are those of WatchdogSec= in systemd.service(5) and of sd_notify(3).
 """
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Mapping
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
+from dora_systemd.values import INFINITY, SECOND, parse_duration, quoted
 
 ALL_NODES = ""
 SHORTEST = SECOND // 5
@@ -33,20 +33,6 @@ def parse_watchdog(text: str) -> int:
     if limit < SHORTEST or text.strip()[-1:].isdigit():
         raise _refusal(text)
     return limit
-
-
-def parse_watchdogs(texts: Iterable[str]) -> dict[str, int]:
-    """Times by node from "5s" and "NODE=2s"; raises DoraSystemdError (USAGE)."""
-    parts = (text.rpartition("=")[::2] for text in texts)
-    return {node.strip(): parse_watchdog(limit) for node, limit in parts}
-
-
-def format_watchdogs(watchdogs: Watchdogs) -> list[str]:
-    """Format watchdogs as texts, the inverse of parse_watchdogs()."""
-    return [
-        f"{node}={format_duration(limit)}" if node else format_duration(limit)
-        for node, limit in watchdogs.items()
-    ]
 
 
 def merge_watchdogs(limits: Watchdogs, sockets: Mapping[str, bool]) -> dict[str, int]:

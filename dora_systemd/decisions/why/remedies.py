@@ -15,9 +15,7 @@ AND_RESTART = f", then {_BY_HAND}"
 _AUTOMATIC = f"{_BY_HAND}; --restart-policy on-failure does this automatically"
 _OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
 _SIZE = "; doractl advise {name} proposes sizes by what was held before"
-_MORE_MEMORY = (
-    f"doractl set {{name}} --memory-limit SIZE, or limit single nodes (--node-limit){_SIZE}"
-)
+_MORE_MEMORY = f"doractl set {{name}} --memory-limit SIZE, or limit single nodes (--node){_SIZE}"
 _REMEDIES = {
     Cause.NODE_FAILED: f"fix {{node}}{AND_RESTART}",
     Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
@@ -25,7 +23,7 @@ _REMEDIES = {
     Cause.NODE_SILENT: "find out why {node} sends nothing, or give it more time: "
     "owes: in the settings file",
     Cause.NODE_OUT_OF_MEMORY: "find the leak in {node}, or run: "
-    f"doractl set {{name}} --node-limit {{node}}:memory=SIZE{_SIZE}",
+    f"doractl set {{name}} --node {{node}}:memory_limit=SIZE{_SIZE}",
     Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",
     Cause.REFUSED: "fix {file}, then run: doractl restart {name}",
     Cause.BAD_DATAFLOW: "fix {file}, then run: doractl restart {name}",
@@ -53,7 +51,7 @@ _REMEDIES = {
 _MEMORY_REMEDIES = {
     "dataflow": _MORE_MEMORY,
     "machine": "the machine is short of memory: limit single nodes "
-    f"(--node-limit NODE:memory=SIZE){_SIZE}",
+    f"(--node NODE:memory_limit=SIZE){_SIZE}",
 }
 """Remedies by the owner of the exceeded memory limit, unless that is the node."""
 _COREDUMPCTL = "; coredumpctl info {pid} shows where it crashed"

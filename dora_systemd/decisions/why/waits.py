@@ -80,7 +80,7 @@ def wait_remedies(waits: Sequence[CpuWait], name: str) -> list[str]:
 
 def _remedies(one: CpuWait, name: str) -> Iterator[str]:
     if one.is_throttled and one.node:
-        yield f"raise its CPU limit: doractl set {name} --node-limit {one.node}:cpu=SHARE"
+        yield f"raise its CPU limit: doractl set {name} --node {one.node}:cpu_limit=CORES"
     elif one.is_throttled:
         yield f"raise its CPU limit: doractl set {name} --cpu-limit SHARE"
     for shared in one.shared:

@@ -38,25 +38,18 @@ const LIMITS = {
   cpu_limit: ["CPU, in cores or percent of one", "1.5"], tasks_limit: ["Processes and threads", "500"],
 };
 
-// In texts such as "camera:memory=2G,cpu=150%", as doractl set --node-limit takes them.
-const WORDS = {
-  memory_limit: "memory", memory_high: "memory-high", cpu_limit: "cpu", tasks_limit: "tasks",
-};
-
 /** The limits of a dataflow, or of one of its nodes, by the same keys. */
 function limitsOf(node, facts) {
   if (!node) return facts;
-  const text = facts.node_limit?.find((one) => one.startsWith(`${node}:`)) ?? "";
-  const known = new Map(text.slice(node.length + 1).split(",").map((one) => one.split("=")));
-  return Object.fromEntries(Object.entries(WORDS)
-    .filter(([, word]) => known.has(word))
-    .map(([key, word]) => [key, known.get(word)]));
+  // In texts such as "camera:memory_limit=2G,cpu_limit=150%", as doractl set --node takes them.
+  const text = facts.nodes?.find((one) => one.startsWith(`${node}:`)) ?? "";
+  return Object.fromEntries(text.slice(node.length + 1).split(",").map((one) => one.split("=")));
 }
 
 /** The new limits as the values of "set". */
 function asSettings(node, limits) {
-  const pairs = Object.entries(limits).map(([key, text]) => `${WORDS[key]}=${text}`);
-  return node && pairs.length ? { node_limit: `${node}:${pairs.join(",")}` } : limits;
+  const pairs = Object.entries(limits).map(([key, text]) => `${key}=${text}`);
+  return node && pairs.length ? { nodes: `${node}:${pairs.join(",")}` } : limits;
 }
 
 /** The buttons of a dataflow. ask: is called with an action. */

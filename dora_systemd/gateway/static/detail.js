@@ -20,7 +20,7 @@ const LIMITS = {
 
 const limitWords = (facts) => [
   ...Object.keys(LIMITS).filter((key) => facts[key]).map((key) => `${LIMITS[key]} ${facts[key]}`),
-  ...(facts.node_limit ?? []),
+  ...(facts.nodes ?? []),
 ].join(", ") || "none";
 
 const inhibitorWords = ({ node, pid, user, why }) =>

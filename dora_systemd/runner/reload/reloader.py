@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import threading
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
@@ -17,8 +17,8 @@ from dora_systemd.adapters.dora.preparation import Prepared, resolved
 from dora_systemd.adapters.host.watch import Since, identity
 from dora_systemd.adapters.runner_socket.client import unknown_request
 from dora_systemd.decisions.cell.limits import check_nodes, limits_of
-from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates, rate_texts
-from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, changed
+from dora_systemd.decisions.cell.line_rates import rates_of
+from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, changed, parse_setting
 from dora_systemd.decisions.cell.rights import essential_nodes
 from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
@@ -314,7 +314,8 @@ class Reloader:
         limits. Raises DoraSystemdError.
         """
         if request.get("verb") == "log-rates":
-            return await self._limit_lines(parse_rates(map(str, request.get("limits") or ())))
+            texts = map(str, request.get("limits") or ())
+            return await self._limit_lines([*map(parse_setting, texts)])
         if request.get("verb") == "hot-reload":
             return await self._switch(bool(request.get("on")))
         if request.get("verb") != "reload":
@@ -358,10 +359,12 @@ class Reloader:
     def _change(self, texts: Iterable[SettingText]) -> None:
         self.options = self.options._replace(settings=changed(self.options.settings, texts))
 
-    async def _limit_lines(self, rates: RateLimits) -> Answer:
+    async def _limit_lines(self, limits: Sequence[SettingText]) -> Answer:
+        options = self.options.without("log_rate_limit")
+        options = options._replace(settings=(*options.settings, *limits))
+        rates = rates_of(options)  # refuses what is no limit
         async with self._lock:
-            self.options = self.options.without("log_rate_limit")
-            self._change(rate_texts(rates))
+            self.options = options
             if self._run is not None:
                 self._run.nodes.limit_lines(rates)
         return {"done": []}

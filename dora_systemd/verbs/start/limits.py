@@ -37,7 +37,7 @@ def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[
         check_memory(record, machine.memory)
     # Without a cpuset controller the launcher binds nodes to their CPUs.
     require_controllers(manager, plan.scope, properties, tuple(map(without_cpus, nodes)))
-    values = {limit.word: plan.settings.values[key] for key, limit in BY_KEY.items()}
+    values = {key: plan.settings.values[key] for key in BY_KEY}
     sizes = size_warnings(values, nodes, machine)
     return (*sizes, *_missing_devices(plan), *_powerless(plan), *_unbound(manager, nodes))
 

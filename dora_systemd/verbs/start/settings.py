@@ -5,12 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, find_line
-from dora_systemd.decisions.cell.rights import BY_KEY
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
-from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.stops import STOP_LIMIT
-from dora_systemd.decisions.settings.table import ENV_FILE, GRACE_DURATION, SETTINGS
+from dora_systemd.decisions.settings.table import ENV_FILE, GRACE_DURATION, NODES, SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import hint_of_changeable
@@ -96,10 +94,9 @@ def _raising(settings: Settings) -> Iterator[tuple[str, str]]:
         if (raises := setting.raises) is not None:
             if settings.is_given(setting) and raises(settings[setting]):
                 yield setting.name, setting.flags[0]
-            flag = (NODE_RIGHTS if setting.name in BY_KEY else setting).flags[0]
             for node, value in settings.by_node(setting).items():
                 if raises(value):
-                    yield f"nodes.{node}.{setting.name}", flag
+                    yield f"nodes.{node}.{setting.name}", NODES.flags[0]
 
 
 def _check_trust(read: SettingsFile) -> None:

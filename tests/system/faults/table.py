@@ -133,7 +133,7 @@ MACHINE = (
 OWN_KERNEL = (
     Fault(
         *("node-fork-bombs", apply.fork_bomb, DORA, 120, "exit code 1"),
-        *((*ON_FAILURE, "--node-limit=sink:tasks=100"), CRASHED),
+        *((*ON_FAILURE, "--node=sink:tasks_limit=100"), CRASHED),
         vm=True,
     ),
     Fault("clock-forward", apply.clock(3600), UNAFFECTED, 60, vm=True),

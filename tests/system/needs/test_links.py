@@ -97,7 +97,7 @@ def test_a_bus_that_was_away_for_a_moment_is_another_one(cell: Cell, project: Pr
 
 @pytest.mark.parametrize("name", ["sixteen-letters0", "can/0", "can%d", "..", ""])
 def test_a_name_that_cannot_be_changes_nothing(cell: Cell, project: Project, name: str) -> None:
-    for flags in ((), ("--needs", f"source=net:{name}")):
+    for flags in ((), ("--node", f"source:needs=net:{name}")):
         path = project.three_nodes() if flags else with_needs(project, [Path(f"net:{name}")])
         if flags:
             (project.root / "dataflow.systemd.yml").unlink()

@@ -104,7 +104,7 @@ def test_only_root_makes_systemd_start_other_units(cell: Cell, project: Project)
 
 def test_a_device_opens_its_group_and_no_other(cell: Cell, project: Project) -> None:
     dataflow = one_node(project)
-    unit = cell.start(dataflow, "--needs", "sink=/dev/pts/77", "--dry-run").stdout
+    unit = cell.start(dataflow, "--node", "sink:needs=/dev/pts/77", "--dry-run").stdout
     if cell.scope.is_user:
         assert "DeviceAllow" not in unit
         return

@@ -7,10 +7,10 @@ import pytest
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.limits import limit_groups
-from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY
+from tests.unit.fakes.limit_values import limits_from
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_limits_of_a_node(unit: Path) -> None:
     for name in ("memory.max", "cpu.max", "memory.oom.group"):
         (group / name).write_text("")
     cgroup.kill_as_one(group)
-    limit_groups([(group, parse_node_limits("camera:memory=1G,cpu=infinity"))])
+    limit_groups([(group, limits_from("camera:memory_limit=1G,cpu_limit=infinity"))])
     assert (group / "memory.oom.group").read_text() == "1"
     assert (group / "memory.max").read_text() == str(1 << 30)
     assert (group / "cpu.max").read_text() == "max 100000"
@@ -60,7 +60,7 @@ def test_limits_of_a_node(unit: Path) -> None:
 
 def test_a_limit_that_nothing_holds_up_is_an_error(unit: Path) -> None:
     with pytest.raises(DoraSystemdError) as caught:
-        limit_groups([(unit / "node-camera", parse_node_limits("camera:tasks=5"))])
+        limit_groups([(unit / "node-camera", limits_from("camera:tasks_limit=5"))])
     assert caught.value.message == "cannot limit the node camera: its group has no pids.max"
 
 
@@ -69,11 +69,11 @@ def test_cpus_of_a_node_are_those_that_the_kernel_uses(unit: Path, used: str) ->
     group = unit / "node-camera"
     (group / "cpuset.cpus").write_text("")
     (group / "cpuset.cpus.effective").write_text(f"{used}\n")
-    limits = parse_node_limits("camera:cpus=2-3")
+    limits = limits_from("camera:cpus=2-3")
     if used == "2-3":
         limit_groups([(group, limits)])
         assert (group / "cpuset.cpus").read_text() == "2-3"
-        limit_groups([(group, parse_node_limits("camera:cpus=infinity"))]).close()
+        limit_groups([(group, limits_from("camera:cpus=infinity"))]).close()
         assert (group / "cpuset.cpus").read_text().startswith("2-3")
         return
     with pytest.raises(DoraSystemdError) as caught:
@@ -86,14 +86,14 @@ def test_a_node_without_cpus_of_its_own_gets_those_of_the_unit(unit: Path) -> No
     (unit / "cpuset.cpus.effective").write_text("0-3\n")
     (group / "cpuset.cpus").write_text("\n")
     (group / "cpuset.cpus.effective").write_text("2")
-    limit_groups([(group, parse_node_limits("camera:cpus=2"))]).close()
+    limit_groups([(group, limits_from("camera:cpus=2"))]).close()
     assert (group / "cpuset.cpus").read_text() == "0-3"
 
 
 def test_limits_of_all_nodes_or_of_none(unit: Path) -> None:
     group = unit / "node-camera"
     (group / "memory.max").write_text("max\n")
-    limits = parse_node_limits("camera:memory=1G"), parse_node_limits("a.b:memory=1G")
+    limits = limits_from("camera:memory_limit=1G"), limits_from("a.b:memory_limit=1G")
     with pytest.raises(DoraSystemdError, match=r"cannot limit the node a\.b: its group has no"):
         limit_groups(zip((group, unit / "node-a.b"), limits, strict=True))
     assert (group / "memory.max").read_text().startswith("max")

@@ -185,7 +185,6 @@ def test_a_mark_of_utf_8_stays(place: Place) -> None:
             "nodes:\n  camera:\n    memory_limit: |\n      100M\n",
             "write nodes: camera: memory_limit",
         ),
-        ("node_limit: [camera:memory=100M]\n", "takes precedence"),
     ],
 )
 def test_what_cannot_be_written_changes_nothing(place: Place, text: str, words: str) -> None:

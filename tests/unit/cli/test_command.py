@@ -390,7 +390,7 @@ def test_settings_stand_by_concern_with_their_defaults(
 ) -> None:
     assert main.run([verb, "--help=all"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    titles = ["Options:", "Nodes:", "Limits:", "Rights of nodes:", "Restarts:"]
+    titles = ["Options:", "Nodes:", "Limits:", "Restarts:"]
     titles += ["Sandbox and secrets:", "Hot reload:"]
     places = [shown.index(f" {title} -") for title in titles]
     assert places == sorted(places)

@@ -4,7 +4,8 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.cell.limits import BY_WORD, NodeLimits, node_limits
+from dora_systemd.decisions.cell.limits import NodeLimits, node_limits
+from dora_systemd.decisions.settings.table import NODES
 from dora_systemd.values import INFINITY, cpu_bits
 
 MEMORY = st.integers(1 << 20, INFINITY)
@@ -12,24 +13,13 @@ CPU = st.integers(100, 10**7).map(lambda hundredths: hundredths * 100) | st.just
 TASKS = st.integers(1, 2**32 - 1) | st.just(INFINITY)
 WEIGHT = st.integers(1, 10000)
 CPUS = st.sets(st.integers(0, 200), min_size=1).map(cpu_bits) | st.just(INFINITY)
-BY_NAME: dict[str, st.SearchStrategy[int]] = {
-    "cpu": CPU,
-    "memory": MEMORY,
-    "memory-high": MEMORY,
-    "swap": st.integers(0, INFINITY),
-    "tasks": TASKS,
-    "cpu-weight": WEIGHT,
-    "io-weight": WEIGHT,
-    "cpus": CPUS,
-}
 IDS = st.from_regex(r"(?!\.)[A-Za-z0-9_.-]{1,20}", fullmatch=True)
 
 
-@st.composite
-def limits_of_a_node(draw: st.DrawFn, ids: st.SearchStrategy[str] = IDS) -> NodeLimits:
-    """Limits of some node, one at least."""
-    words = draw(st.sets(st.sampled_from(sorted(BY_WORD)), min_size=1))
-    return node_limits(draw(ids), {word: draw(BY_NAME[word]) for word in words})
+def limits_from(text: str) -> NodeLimits:
+    """The limits of a node, as --node takes them."""
+    ((node, values),) = NODES.kind.parse([text], None).items()
+    return node_limits(node, values)
 
 
 _TIME = st.integers(1, 10**12)
@@ -52,7 +42,6 @@ LIMIT_VALUES: dict[str, st.SearchStrategy[Any]] = {
     "cpu_weight": WEIGHT,
     "io_weight": WEIGHT,
     "cpus": CPUS,
-    "node_limit": st.lists(limits_of_a_node(), unique_by=lambda one: one.node).map(tuple),
     "nice": st.integers(-20, 19),
     "realtime": st.builds("{}:{}".format, st.sampled_from(["rr", "fifo"]), st.integers(1, 99)),
     "device": st.lists(

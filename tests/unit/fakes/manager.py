@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Beside, Observer, Property, UnitState
-from dora_systemd.decisions.cell.limits import BY_WORD, NodeLimits
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     SettingText,
@@ -16,11 +16,11 @@ from dora_systemd.decisions.cell.options import (
 )
 from dora_systemd.decisions.cell.owes import Owed, format_owed
 from dora_systemd.decisions.cell.restarts import POLICY_KEYS, RestartPolicy
-from dora_systemd.decisions.cell.rights import BY_KEY, NodeRights, given_rights
+from dora_systemd.decisions.cell.rights import NodeRights, given_rights
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_description, unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.values import format_duration, format_number
+from dora_systemd.values import format_duration, format_number, scalar_text
 
 
 class ScopeIn(Scope):
@@ -57,20 +57,17 @@ def with_texts(options: RunnerOptions, *texts: str) -> RunnerOptions:
 
 
 def with_limits(options: RunnerOptions, *limits: NodeLimits) -> RunnerOptions:
-    given = ((one.node, BY_WORD[word], value) for one in limits for word, value in one.limits)
+    given = ((one.node, BY_KEY[key], value) for one in limits for key, value in one.limits)
     return _with(options, (SettingText(n, one.key, one.format(value)) for n, one, value in given))
 
 
 def with_rights(options: RunnerOptions, *rights: NodeRights) -> RunnerOptions:
     given = ((one.node, key, value) for one in rights for key, value in given_rights(one).items())
-    return _with(options, (SettingText(n, key, BY_KEY[key].format(v)) for n, key, v in given))
+    return _with(options, (SettingText(n, key, scalar_text(v)) for n, key, v in given))
 
 
 def with_owes(options: RunnerOptions, *owes: Owed) -> RunnerOptions:
-    return _with(
-        options,
-        (SettingText(one.node, "owes", format_owed(one._replace(node=""))) for one in owes),
-    )
+    return _with(options, (SettingText(one.node, "owes", format_owed(one)) for one in owes))
 
 
 def with_restart(options: RunnerOptions, policy: RestartPolicy, node: str = "") -> RunnerOptions:

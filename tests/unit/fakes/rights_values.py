@@ -5,7 +5,7 @@ from typing import Any
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.rights import NodeRights
-from tests.unit.fakes.limit_values import IDS
+from dora_systemd.decisions.settings.table import NODES
 
 REALTIME = st.builds("{}:{}".format, st.sampled_from(["rr", "fifo"]), st.integers(1, 99))
 VALUES: dict[str, st.SearchStrategy[Any]] = {
@@ -17,15 +17,13 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
 }
 
 
-@st.composite
-def rights_of_a_node(draw: st.DrawFn) -> NodeRights:
-    """Rights of some node, one at least."""
-    keys = draw(st.sets(st.sampled_from(sorted(VALUES)), min_size=1))
-    return NodeRights(draw(IDS), **{key: draw(VALUES[key]) for key in sorted(keys)})
+def rights_from(text: str) -> NodeRights:
+    """The rights of a node, as --node takes them."""
+    ((node, values),) = NODES.kind.parse([text], None).items()
+    return NodeRights(node, **values)
 
 
 RIGHTS_VALUES: dict[str, st.SearchStrategy[Any]] = {
     **{key: VALUES[key] for key in ("scheduling", "oom_score_adjust")},
-    "node_rights": st.lists(rights_of_a_node(), unique_by=lambda one: one.node).map(tuple),
 }
 """By name of the setting; switches have none."""

@@ -168,8 +168,8 @@ def test_the_page_starts_what_has_ended(
     [
         ("set", {}, "cannot change the limits of robot: none is given"),
         ("set", {"memory_limit": "much"}, "cannot read 'much' as a size"),
-        ("set", {"node_limit": "a:memory=much"}, "cannot read 'much' as a size"),
-        ("set", {"node_limit": "nobody:memory=2G"}, "cannot limit the node 'nobody'"),
+        ("set", {"nodes": "a:memory_limit=much"}, "cannot read 'much' as a size"),
+        ("set", {"nodes": "nobody:memory_limit=2G"}, "cannot limit the node 'nobody'"),
         ("set", {"hot_reload": "on"}, "robot"),
         ("reload", {}, "robot"),
     ],

@@ -95,9 +95,6 @@ LATE = {
         "adapters.host.files": {"yaml", "adapters.host.yaml_loader"},
         "cli.verbs.look.logs": {"verbs.follow", "cli.remote.machines"},
     },
-    "limits, CPUs or rights of single nodes only": {
-        "decisions.cell.limits": {"node_words"},
-    },
     "uv only": {"decisions.cell.uv": {"tomllib"}},
     "JSON is for programs, and most who do something are people": {
         "cli.parameters": {"decisions.views.objects"},

@@ -12,8 +12,8 @@ from dora_systemd.adapters.host.unit_files import (
     remove_changes,
 )
 from dora_systemd.decisions.cell.environment import node_environment, with_changes
-from dora_systemd.decisions.cell.limits import limits_of, parse_node_limits
-from dora_systemd.decisions.cell.line_rates import parse_rates, rates_of
+from dora_systemd.decisions.cell.limits import limits_of
+from dora_systemd.decisions.cell.line_rates import parse_rate, rates_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import runner_command
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
@@ -23,6 +23,7 @@ from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
 from tests.unit.fakes.cgroups import fake_cgroups
+from tests.unit.fakes.limit_values import limits_from
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options, with_limits, with_texts
 
 NODES = {"camera": NodeStatus("running", 5, kind="python"), "ui": NodeStatus(kind="dynamic")}
@@ -85,19 +86,19 @@ def test_limits_of_the_dataflow(place: Place) -> None:
 
 
 def test_limits_of_a_node_hold_now_and_later(place: Place) -> None:
-    assert place.set(node_limit=("camera:memory=2M,cpu=1.5",)) == ()
+    assert place.set(nodes=("camera:memory_limit=2M,cpu_limit=1.5",)) == ()
     assert place.manager.calls == [("reload",)]
     assert (place.group / "memory.max").read_text() == str(2 << 20)
     assert (place.group / "cpu.max").read_text() == "150000 100000"
     assert place.drop_in.read_text().splitlines()[1:] == [
         "[Service]",
-        'Environment="DORA_SYSTEMD_SET=camera:cpu_limit=150%% camera:memory_limit=2M"',
+        'Environment="DORA_SYSTEMD_SET=camera:memory_limit=2M camera:cpu_limit=150%%"',
     ]
 
 
 def test_a_unit_file_keeps_its_changes_until_it_goes(place: Place) -> None:
     place.manager.units[place.unit]["Transient"] = False
-    place.set(node_limit=("camera:memory=2M",))
+    place.set(nodes=("camera:memory_limit=2M",))
     fragment = place.units / "dora-robot.service"
     (drop_in,) = changed_files(fragment)
     assert drop_in == place.root / "units.control/dora-robot.service.d" / SET_FILE
@@ -109,7 +110,7 @@ def test_a_unit_file_keeps_its_changes_until_it_goes(place: Place) -> None:
 def test_changes_add_up(place: Place) -> None:
     before = "DORA_SYSTEMD_SET=camera:cpu_limit=150% camera:memory_limit=2M other:tasks_limit=3"
     place.manager.units[place.unit]["Environment"].append(before)
-    place.set(node_limit=("camera:memory=infinity,tasks=9",), tasks_limit="50")
+    place.set(nodes=("camera:memory_limit=infinity,tasks_limit=9",), tasks_limit="50")
     assert [call[0] for call in place.manager.calls] == ["set", "reload"]
     assert (
         place.drop_in.read_text()
@@ -132,11 +133,11 @@ def test_hot_reload_is_remembered_beside_the_limits(place: Place) -> None:
 def test_what_is_too_small_or_too_large_is_said(place: Place) -> None:
     (place.group / "memory.current").write_text(str(5 << 20))
     with pytest.raises(DoraSystemdError) as caught:
-        place.set(node_limit=("camera:memory=2M",))
+        place.set(nodes=("camera:memory_limit=2M",))
     told = "cannot limit the memory of the node camera to 2M: it uses 5M now"
     assert (caught.value.message, "--force" in caught.value.hint) == (told, True)
     assert (place.manager.calls, place.drop_in.exists()) == ([], False)
-    flags = {"node_limit": ("camera:memory=2M",), "cpu_limit": "99999"}
+    flags = {"nodes": ("camera:memory_limit=2M",), "cpu_limit": "99999"}
     (warning,) = set_limits(place.manager, place.scope, place.cell, flags, is_forced=True)
     assert "than this machine has" in warning
     assert "camera:memory_limit=2M" in place.drop_in.read_text()
@@ -156,9 +157,9 @@ def test_a_limit_below_what_the_dataflow_uses(place: Place) -> None:
         ({}, ExitCode.USAGE, "none is given"),
         ({"memory_limit": "0"}, ExitCode.USAGE, "'0'"),
         ({"memory_limit": "6M", "cpu_limit": "-1"}, ExitCode.USAGE, "'-1'"),
-        ({"memory_limit": "6M", "node_limit": ("camera:cpu=x",)}, ExitCode.USAGE, "'x'"),
-        ({"memory_limit": "6M", "node_limit": ("nobody:cpu=1",)}, ExitCode.BAD_INPUT, "'nobody'"),
-        ({"node_limit": ("camera:cpu=1", "ui:cpu=1")}, ExitCode.BAD_INPUT, "dynamic"),
+        ({"memory_limit": "6M", "nodes": ("camera:cpu_limit=x",)}, ExitCode.USAGE, "'x'"),
+        ({"memory_limit": "6M", "nodes": ("nobody:cpu_limit=1",)}, ExitCode.BAD_INPUT, "'nobody'"),
+        ({"nodes": ("camera:cpu_limit=1", "ui:cpu_limit=1")}, ExitCode.BAD_INPUT, "dynamic"),
         ({"memory_limit": "6M", "io_weight": "5"}, ExitCode.NO_SYSTEMD, "'io' cgroup controller"),
     ],
 )
@@ -177,7 +178,7 @@ def test_nothing_changes_if_anything_is_wrong(
 def test_nothing_changes_if_somebody_refuses(
     place: Place, refuser: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flags = {"node_limit": ("camera:memory=2M,tasks=9",), "memory_limit": "6M"}
+    flags = {"nodes": ("camera:memory_limit=2M,tasks_limit=9",), "memory_limit": "6M"}
     (place.group / "memory.max").write_text(str(1 << 20))
     if refuser == "kernel":
         (place.group / "pids.max").unlink()
@@ -200,7 +201,7 @@ def test_nothing_changes_if_somebody_refuses(
 def test_what_was_changed_before_stays_when_systemd_refuses(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place.set(node_limit=("camera:memory=2M",))
+    place.set(nodes=("camera:memory_limit=2M",))
     before = place.drop_in.read_text()
 
     def refuse(*_: object) -> None:
@@ -208,7 +209,7 @@ def test_what_was_changed_before_stays_when_systemd_refuses(
 
     monkeypatch.setattr(place.manager, "set_properties", refuse)
     with pytest.raises(DoraSystemdError):
-        place.set(node_limit=("camera:memory=3M",), memory_limit="6M")
+        place.set(nodes=("camera:memory_limit=3M",), memory_limit="6M")
     assert place.drop_in.read_text() == before
     assert (place.group / "memory.max").read_text() == str(2 << 20)
 
@@ -217,7 +218,7 @@ def test_a_node_without_a_group_is_limited_at_its_next_start(place: Place) -> No
     for name in FILES:
         (place.group / name).unlink()
     place.group.rmdir()
-    place.set(node_limit=("camera:memory=2M",))
+    place.set(nodes=("camera:memory_limit=2M",))
     assert "camera:memory_limit=2M" in place.drop_in.read_text()
 
 
@@ -245,7 +246,10 @@ class Runner:
 
 
 def rates(place: Place, *texts: str, runner: Runner, **flags: Any) -> tuple[str, ...]:
-    flags = {"log_rate_limit": texts, **flags}
+    for text in texts:
+        node, _, rate = text.rpartition("=")
+        given = (f"{node}:log_rate_limit={rate}",)
+        flags |= {"nodes": given} if node else {"log_rate_limit": rate}
     return set_limits(place.manager, place.scope, place.cell, flags, ask=runner)
 
 
@@ -255,7 +259,8 @@ def test_lines_of_a_running_dataflow(place: Place) -> None:
         "DORA_SYSTEMD_SET=ui:log_rate_limit=9/1s 'log_rate_limit=50/1min 30s'"
     ]
     rates(place, "camera=10/1s", "100/1s", runner=runner)
-    assert runner.asked == [["100/1s", "ui=9/1s", "camera=10/1s"]]
+    expected = [("", "100/1s"), ("ui:", "9/1s"), ("camera:", "10/1s")]
+    assert runner.asked == [[f"{one[0]}log_rate_limit={one[1]}" for one in expected]]
     text = place.drop_in.with_name(SET_FILE).read_text()
     assert "ui:log_rate_limit=9/1s log_rate_limit=100/1s camera:log_rate_limit=10/1s" in text
     assert place.manager.calls == [("reload",)]
@@ -295,7 +300,7 @@ def test_lines_that_systemd_refuses(place: Place, monkeypatch: pytest.MonkeyPatc
     runner = Runner()
     with pytest.raises(DoraSystemdError):
         rates(place, "ui=1/1s", runner=runner, memory_limit="6M")
-    assert runner.asked == [["ui=1/1s"], []]
+    assert runner.asked == [["ui:log_rate_limit=1/1s"], []]
     assert not place.drop_in.parent.exists()
 
 
@@ -303,18 +308,18 @@ def test_lines_of_the_next_runner() -> None:
     before = with_texts(options(), "log_rate_limit=9/1s", "camera:log_rate_limit=8/1s")
     texts = "camera:log_rate_limit=infinity 'ui:log_rate_limit=50/1min 30s'"
     variables = {"DORA_SYSTEMD_SET": texts}
-    expected = parse_rates(["9/1s", "camera=infinity", "ui=50/90s"])
+    expected = {"": parse_rate("9/1s"), "camera": None, "ui": parse_rate("50/90s")}
     assert rates_of(with_changes(before, variables)) == expected
     assert node_environment(variables) == {}
 
 
 def test_the_runner_is_told() -> None:
-    before = with_limits(options(), parse_node_limits("camera:cpu=1,memory=1G"))
+    before = with_limits(options(), limits_from("camera:cpu_limit=1,memory_limit=1G"))
     variables = {"DORA_SYSTEMD_SET": "camera:memory_limit=2G ui:tasks_limit=9"}
     assert with_changes(before, {}) == before
     assert limits_of(with_changes(before, variables)) == (
-        parse_node_limits("camera:cpu=1,memory=2G"),
-        parse_node_limits("ui:tasks=9"),
+        limits_from("camera:cpu_limit=1,memory_limit=2G"),
+        limits_from("ui:tasks_limit=9"),
     )
     assert node_environment(variables) == {}
 
@@ -329,7 +334,7 @@ def test_a_reload_that_systemd_refuses_leaves_nothing(
 
     monkeypatch.setattr(place.manager, "reload", refuse)
     with pytest.raises(DoraSystemdError, match="not enough space"):
-        place.set(node_limit=("camera:memory=2M",))
+        place.set(nodes=("camera:memory_limit=2M",))
     with pytest.raises(DoraSystemdError, match="not enough space"):
         switch_hot_reload(place.manager, place.scope, place.cell, True, lambda *_: {})
     assert not place.drop_in.parent.exists()

@@ -15,9 +15,10 @@ from dora_systemd.adapters.host.rights import (
     prove_rights,
     read_base,
 )
-from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.cell.rights import BEHIND_ESSENTIAL, NodeRights, parse_node_rights
+from dora_systemd.decisions.cell.rights import BEHIND_ESSENTIAL, NodeRights
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from tests.unit.fakes.limit_values import limits_from
+from tests.unit.fakes.rights_values import rights_from
 
 
 def test_base_of_this_process() -> None:
@@ -44,7 +45,7 @@ class Prover:
 def test_what_everybody_may_have_is_proved() -> None:
     prove_rights([], prove := Prover())
     assert not prove.commands
-    rights = [parse_node_rights("a:scheduling=idle,essential"), parse_node_rights("b:nice=19")]
+    rights = [rights_from("a:scheduling=idle,essential=yes"), rights_from("b:nice=19")]
     prove_rights(rights, prove)
     assert prove.done == [Completed(0, "", "")] * 3
     idle, nice, _ = prove.commands
@@ -72,13 +73,13 @@ def test_a_program_that_only_complains_is_a_refusal() -> None:
 
 def test_cpus_of_this_process() -> None:
     usable = sorted(os.sched_getaffinity(0))
-    check_cpus([parse_node_limits(f"a:cpus={usable[0]}"), parse_node_limits("b:memory=1G")])
+    check_cpus([limits_from(f"a:cpus={usable[0]}"), limits_from("b:memory_limit=1G")])
     with pytest.raises(DoraSystemdError, match="the node c to the cpus 8191: the dataflow may"):
-        check_cpus([parse_node_limits(f"c:cpus={usable[-1]},8191")])
+        check_cpus([limits_from(f"c:cpus={usable[-1]},8191")])
 
 
 def test_a_process_without_a_launcher_loses_what_others_have() -> None:
-    rights = [parse_node_rights("a:scheduling=fifo:5,nice=-5,essential")]
+    rights = [rights_from("a:scheduling=fifo:5,nice=-5,essential=yes")]
     with subprocess.Popen(["/bin/sleep", "60"]) as child:
         lower_rights(child.pid, "ros", rights)
         for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_NICE):

@@ -5,9 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.limits import (
-    format_node_limits,
     has_cpus,
-    parse_node_limits,
     without_cpus,
 )
 from dora_systemd.decisions.settings.limit_checks import (
@@ -26,6 +24,7 @@ from dora_systemd.values import (
     format_cpus,
     parse_cpus,
 )
+from tests.unit.fakes.limit_values import limits_from
 
 
 @given(st.sets(st.integers(0, MOST_CPUS - 1), min_size=1, max_size=50))
@@ -63,20 +62,20 @@ def test_bad_lists(text: str) -> None:
 
 
 def test_as_a_limit_of_a_node() -> None:
-    limits = parse_node_limits("a:memory=1G,cpus=0,2-3,cpu=1.5")
-    assert format_node_limits(limits) == "a:cpu=150%,memory=1G,cpus=0,2-3"
+    limits = limits_from("a:memory_limit=1G,cpus=0,2-3,cpu_limit=1.5")
+    assert dict(limits.limits)["cpus"] == cpu_bits([0, 2, 3])
     assert limits.files()["cpuset.cpus"] == "0,2-3"
     assert has_cpus(limits)
-    assert format_node_limits(without_cpus(limits)) == "a:cpu=150%,memory=1G"
+    assert without_cpus(limits) == limits_from("a:memory_limit=1G,cpu_limit=1.5")
     assert "cpuset" in needed_controllers({}, [limits])
-    lifted = parse_node_limits("a:cpus=infinity")
+    lifted = limits_from("a:cpus=infinity")
     assert not has_cpus(lifted)
     assert needed_controllers({}, [lifted]) == {}
 
 
 def test_cpus_that_the_machine_lacks() -> None:
     machine = Machine(1 << 30, 2, 1000, frozenset({0, 1}))
-    limits = [parse_node_limits("a:cpus=1"), parse_node_limits("b:cpus=1-3")]
+    limits = [limits_from("a:cpus=1"), limits_from("b:cpus=1-3")]
     with pytest.raises(DoraSystemdError) as caught:
         check_cpus(limits, machine)
     assert caught.value.message == (

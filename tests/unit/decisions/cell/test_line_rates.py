@@ -1,5 +1,6 @@
 """Limits on a node's lines: their texts, whose they are, and what they take."""
 
+from collections.abc import Mapping
 from itertools import pairwise
 
 import pytest
@@ -14,16 +15,17 @@ from dora_systemd.decisions.cell.line_rates import (
     RateLimits,
     check_rates,
     format_rate,
-    format_rates,
     parse_rate,
-    parse_rates,
     rate_of,
+    rate_texts,
     rates_of,
 )
+from dora_systemd.decisions.cell.options import format_setting
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings, with_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.dialogue import OPTIONS
+from tests.unit.fakes.manager import with_texts
 
 LIMIT = RateLimit(3, SECOND)
 RATES = st.builds(RateLimit, st.integers(1, 10**18 - 1), st.integers(SHORTEST, INFINITY - 1))
@@ -60,10 +62,14 @@ def test_bad_limits(text: str) -> None:
     assert caught.value.code is ExitCode.USAGE
 
 
+TEXTS = [
+    *("log_rate_limit=1000/1s", "camera:log_rate_limit=5/1s", "lidar:log_rate_limit=infinity"),
+]
+
+
 def test_limits_of_nodes() -> None:
-    texts = ["1000/1s", "camera=5/1s", "lidar=infinity"]
-    limits = parse_rates(texts)
-    assert format_rates(limits) == texts
+    limits = rates_of(with_texts(OPTIONS, *TEXTS))
+    assert [format_setting(one) for one in rate_texts(limits)] == TEXTS
     assert rate_of(limits, "camera") == RateLimit(5, SECOND)
     assert rate_of(limits, "lidar") is None
     assert rate_of(limits, "other") == RateLimit(1000, SECOND)
@@ -74,8 +80,8 @@ def rates_of_settings(settings: Settings) -> RateLimits:
     return rates_of(with_settings(OPTIONS, settings))
 
 
-def settings(flags: tuple[str, ...] = (), document: object = None) -> Settings:
-    return resolve_settings({"log_rate_limit": flags}, {}, [("/srv/robot.systemd.yml", document)])
+def settings(flags: Mapping[str, object], document: object = None) -> Settings:
+    return resolve_settings(flags, {}, [("/srv/robot.systemd.yml", document)])
 
 
 def test_a_flag_for_a_node_wins_and_one_for_all_does_not() -> None:
@@ -83,22 +89,18 @@ def test_a_flag_for_a_node_wins_and_one_for_all_does_not() -> None:
         "log_rate_limit": "9/1s",
         "nodes": {"camera": {"log_rate_limit": "5/1s"}, "lidar": {"log_rate_limit": "infinity"}},
     }
-    texts = format_rates(rates_of_settings(settings(("camera=1/1s", "8/1s"), document)))
-    assert sorted(texts) == ["8/1s", "camera=1/1s", "lidar=infinity"]
+    flags = {"nodes": ("camera:log_rate_limit=1/1s",), "log_rate_limit": "8/1s"}
+    assert rates_of_settings(settings(flags, document)) == {
+        **{ALL_NODES: RateLimit(8, SECOND), "camera": RateLimit(1, SECOND), "lidar": None}
+    }
     variables = {"DORA_LOG_RATE_LIMIT": "7/1s"}
     assert rates_of_settings(resolve_settings({}, variables, [])) == {
         ALL_NODES: RateLimit(7, SECOND)
     }
 
 
-def test_a_node_in_a_file_cannot_name_another() -> None:
-    document = {"nodes": {"camera": {"log_rate_limit": "lidar=5/1s"}}}
-    with pytest.raises(DoraSystemdError, match=r"'lidar=5/1s' as log_rate_limit of node camera"):
-        rates_of_settings(settings((), document))
-
-
 def test_a_limit_must_name_a_node_that_is_there() -> None:
-    limits = parse_rates(("1/1s", "camra=1/1s"))
+    limits = {ALL_NODES: LIMIT, "camra": LIMIT}
     with pytest.raises(DoraSystemdError, match=r"^cannot limit the lines .*'camra'") as caught:
         check_rates(limits, ["camera", "lidar"])
     assert caught.value.hint == "did you mean camera?"

@@ -5,9 +5,9 @@ import pytest
 from dora_systemd.decisions.cell.needs import (
     NodeNeed,
     check_needs,
-    needs_by_node,
     needs_of,
     parse_needs,
+    parse_node_needs,
 )
 from dora_systemd.decisions.cell.options import format_runner_argv, parse_runner_argv
 from dora_systemd.decisions.needs.units import needs_properties
@@ -21,9 +21,7 @@ def test_each_need_is_kept_once_and_in_its_shortest_form() -> None:
     assert parse_needs(texts) == (
         *("network", "clock", "dataflow:base", "unit:a@b.service", "mount:/mnt/x"),
     )
-    assert parse_needs(["camera=/dev//video0", "/dev/./video0"]) == (
-        *("camera=/dev/video0", "/dev/video0"),
-    )
+    assert parse_node_needs(["/dev//video0", "/dev/./video0"]) == ("/dev/video0",)
 
 
 @pytest.mark.parametrize(
@@ -53,13 +51,11 @@ def test_each_need_is_kept_once_and_in_its_shortest_form() -> None:
     ],
 )
 def test_other_words_are_refused_in_one_line(text: str) -> None:
-    if text == "clock=/x\n":
-        assert parse_needs([text]) == ("clock=/x",)  # a node may have that name
-        return
-    with pytest.raises(DoraSystemdError) as caught:
-        parse_needs([text])
-    assert "\n" not in caught.value.message + caught.value.hint
-    assert caught.value.hint
+    for parse in (parse_needs, parse_node_needs):
+        with pytest.raises(DoraSystemdError) as caught:
+            parse([text])
+        assert "\n" not in caught.value.message + caught.value.hint
+        assert caught.value.hint
 
 
 @pytest.mark.parametrize(
@@ -70,26 +66,23 @@ def test_other_words_are_refused_in_one_line(text: str) -> None:
     ],
 )
 def test_an_interface_that_cannot_be_is_refused(name: str) -> None:
-    for text in (f"net:{name}", f"arm=net:{name}"):
-        if name == "can0\n":  # the end of a line is no part of a need
-            assert parse_needs([text]) == (text.strip(),)
-            continue
-        with pytest.raises(DoraSystemdError) as caught:
-            parse_needs([text])
-        assert "\n" not in caught.value.message
-        assert "net:can0" in caught.value.hint
+    if name == "can0\n":  # the end of a line is no part of a need
+        assert parse_node_needs([f"net:{name}"]) == ("net:can0",)
+        return
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_node_needs([f"net:{name}"])
+    assert "\n" not in caught.value.message
+    assert "net:can0" in caught.value.hint
 
 
 def test_an_interface_is_kept_as_the_kernel_names_it() -> None:
-    texts = ("net:fifteen-letters", "arm=net:can0", "net:a=b", "arm=net:enp3s0.7@", "net:7")
-    assert parse_needs(texts) == texts
-    nodes = needs_by_node(("arm=net:can0",), {"base": ("net:a=b", "/dev/a=/b")})
-    assert nodes == {"base": ("net:a=b", "/dev/a=/b"), "arm": ("net:can0",)}
+    texts = ("net:fifteen-letters", "net:a=b", "net:enp3s0.7@", "net:7", "/dev/a=/b")
+    assert parse_node_needs(texts) == texts
 
 
 def test_a_dataflow_needs_no_interface() -> None:
     with pytest.raises(DoraSystemdError) as caught:
-        needs_by_node(("net:can0",), {})
+        parse_needs(("net:can0",))
     assert caught.value.message.endswith("a network interface is what a node needs")
     assert "nodes: NODE: needs: net:can0" in caught.value.hint
 
@@ -101,22 +94,18 @@ def test_a_word_that_is_nearly_right_gets_a_hint() -> None:
 
 
 def test_paths_are_for_nodes_and_units_for_the_dataflow() -> None:
-    given = ("network", "camera=/dev/video0")
-    assert needs_by_node(given, {"arm": ("/dev/ttyUSB0", "/dev/ttyUSB1")}) == {
-        "arm": ("/dev/ttyUSB0", "/dev/ttyUSB1"),
-        "camera": ("/dev/video0",),
-    }
-    with pytest.raises(DoraSystemdError):
-        needs_by_node(("/dev/video0",), {})
-    for texts in (("network",), ("b=/x",)):
-        with pytest.raises(DoraSystemdError):
-            needs_by_node((), {"a": texts})
+    with pytest.raises(DoraSystemdError, match="a path is what a node needs"):
+        parse_needs(("network", "/dev/video0"))
+    for text in ("network", "unit:x.service"):
+        with pytest.raises(DoraSystemdError, match="a node needs paths and net:INTERFACE"):
+            parse_node_needs(("/dev/video0", text))
 
 
 def test_the_need_of_a_node_survives_the_command_line() -> None:
     file = "/srv/robot.systemd.yml"
+    flags = {"nodes": ("arm:needs=/dev/a",), "needs": ("network",)}
     document = {"nodes": {"camera.left": {"needs": ["/dev/v4l/by-id/a=b", "net:can0"]}}}
-    settings = resolve_settings({"needs": ("arm=/dev/a", "network")}, {}, [(file, document)])
+    settings = resolve_settings(flags, {}, [(file, document)])
     argv = format_runner_argv(with_settings(runner_options(), settings))
     assert needs_of(parse_runner_argv(argv)) == (
         NodeNeed("camera.left", "/dev/v4l/by-id/a=b"),

@@ -73,7 +73,7 @@ ALL = RunnerOptions(
     start_timeout=90 * SECOND,
     settings=(
         SettingText("camera", "nice", "5"),
-        SettingText("camera", "owes", "/image:within=2s,first=1min 30s,then=warn"),
+        SettingText("camera", "owes", "image:within=2s,first=1min 30s,then=warn"),
         SettingText("", "restart_policy", "on-failure"),
         SettingText("a:b", "max_restarts", "infinity"),
         SettingText("", "stop_limit", "1h"),
@@ -86,7 +86,7 @@ ARGUMENTS = f"""\
 --venv=/srv/venv --exit-when-nodes-finish=no
 '--start-timeout=1min 30s'
 --env-key=MODEL --env-key=RATE
---set=camera:nice=5 '--set=camera:owes=/image:within=2s,first=1min 30s,then=warn'
+--set=camera:nice=5 '--set=camera:owes=image:within=2s,first=1min 30s,then=warn'
 --set=restart_policy=on-failure --set=a:b:max_restarts=infinity --set=stop_limit=1h
 --set=camera:watch=x=y --set=replace=start-first
 --uv --debug --allow-shell-nodes --attached /srv/robot.yml

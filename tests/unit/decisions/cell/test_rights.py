@@ -1,22 +1,18 @@
 """Rights of single nodes, and the programs that set them."""
 
 import pytest
-from hypothesis import given
 
 from dora_systemd.decisions.cell.rights import (
+    RAISES,
     Base,
     NodeRights,
     check_rights_nodes,
     described,
     essential_nodes,
     format_commands,
-    format_node_rights,
     given_rights,
     has_process_rights,
     limits_of_others,
-    merge_node_rights,
-    parse_node_rights,
-    raises_rights,
     rights_commands,
     rights_of,
 )
@@ -26,29 +22,19 @@ from dora_systemd.decisions.unit.properties import rights_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from tests.unit.fakes.dialogue import OPTIONS
 from tests.unit.fakes.manager import with_rights
-from tests.unit.fakes.rights_values import rights_of_a_node
+from tests.unit.fakes.rights_values import rights_from
 
 
-@given(rights_of_a_node())
-def test_there_and_back(rights: NodeRights) -> None:
-    assert parse_node_rights(format_node_rights(rights)) == rights
-
-
-def test_what_is_written() -> None:
-    text = "camera:scheduling=fifo:50,nice=-5,lock-memory=yes,oom-score-adjust=-500,essential=yes"
-    assert format_node_rights(parse_node_rights(text)) == text
-    short = parse_node_rights("camera:essential,scheduling=fifo:07")
+def test_what_is_given() -> None:
+    short = rights_from("camera:essential=yes,scheduling=fifo:07")
     assert short == NodeRights("camera", scheduling="fifo:7", essential=True)
-    assert given_rights(parse_node_rights("a:essential=no")) == {"essential": False}
+    assert given_rights(rights_from("a:essential=no")) == {"essential": False}
 
 
 @pytest.mark.parametrize(
     ("text", "hint"),
     [
-        *[(text, "write NODE:scheduling=fifo:50") for text in ("", "a", "a:", ":nice=5")],
-        ("a:priority=5", "valid values: scheduling, nice"),
-        ("a:essentail", "did you mean essential?"),
-        ("a:nice=5,nice=6", "leave one"),
+        ("a:essentail=yes", "did you mean essential?"),
         *[(f"a:scheduling={one}", "fifo:PRIORITY with 1 to 99") for one in ("fifo", "fifo:0")],
         *[(f"a:scheduling={one}", "fifo:PRIORITY") for one in ("fifo:100", "fifo:-1", "fifo:x")],
         ("a:scheduling=rr:", "rr:PRIORITY with 1 to 99"),
@@ -56,13 +42,13 @@ def test_what_is_written() -> None:
         ("a:scheduling=batch:5", "did you mean batch?"),
         ("a:scheduling=deadline", "valid values: fifo:PRIORITY, rr:PRIORITY, batch, idle, other"),
         *[(f"a:nice={one}", "from -20") for one in ("20", "-21", "", "x", "1.5", "--1")],
-        *[(f"a:oom-score-adjust={one}", "from -1000") for one in ("1001", "-1001", "", "never")],
-        ("a:lock-memory=maybe", "yes or no"),
+        *[(f"a:oom_score_adjust={one}", "from -1000") for one in ("1001", "-1001", "", "never")],
+        ("a:lock_memory=maybe", "yes or no"),
     ],
 )
 def test_bad_rights(text: str, hint: str) -> None:
-    with pytest.raises(DoraSystemdError, match=r"^cannot ") as caught:
-        parse_node_rights(text)
+    with pytest.raises(DoraSystemdError, match=r"^cannot .*\(--node( a:[a-z_]+)?\)$") as caught:
+        resolve_settings({"nodes": (text,)}, {}, ())
     assert hint in caught.value.hint
     assert caught.value.code is ExitCode.USAGE
 
@@ -73,12 +59,13 @@ def test_bad_rights(text: str, hint: str) -> None:
         *[(f"scheduling={one}", False) for one in ("batch", "idle", "other")],
         *[(f"scheduling={one}", True) for one in ("fifo:1", "rr:99")],
         *[(f"nice={number}", number < 0) for number in (-20, -1, 0, 19)],
-        *[(f"oom-score-adjust={number}", number < 0) for number in (-1000, -1, 0, 1000)],
-        *[("lock-memory", True), ("lock-memory=no", False), ("essential", False)],
+        *[(f"oom_score_adjust={number}", number < 0) for number in (-1000, -1, 0, 1000)],
+        *[("lock_memory=yes", True), ("lock_memory=no", False), ("essential=yes", False)],
     ],
 )
 def test_what_only_root_may_give(text: str, is_raised: bool) -> None:
-    assert raises_rights(parse_node_rights(f"a:{text}")) is is_raised
+    ((key, value),) = given_rights(rights_from(f"a:{text}")).items()
+    assert RAISES[key](value) is is_raised
 
 
 def test_sources() -> None:
@@ -86,37 +73,32 @@ def test_sources() -> None:
         "nodes": {
             "a": {"scheduling": "rr:5", "essential": True, "memory_limit": "1G"},
             "b": {"memory_limit": "1G"},
+            "d": {"nice": 5},
             "c": {"nice": 3, "oom_score_adjust": "-100", "lock_memory": "yes"},
         },
-        "node_rights": "d:nice=5",
     }
-    flags = {"node_rights": ("a:scheduling=fifo:9,essential=no", "d:essential")}
+    flags = {"nodes": ("a:scheduling=fifo:9,essential=no", "d:essential=yes")}
     settings = resolve_settings(flags, {}, [("/srv/robot.systemd.yml", beside)])
-    assert [format_node_rights(one) for one in rights_of(with_settings(OPTIONS, settings))] == [
-        "a:scheduling=fifo:9,essential=no",
-        "c:nice=3,lock-memory=yes,oom-score-adjust=-100",
-        "d:nice=5,essential=yes",
-    ]
-
-
-def test_merging_keeps_what_is_not_given_again() -> None:
-    one, other = parse_node_rights("a:nice=5"), parse_node_rights("a:essential")
-    assert merge_node_rights([one], [other]) == (NodeRights("a", nice=5, essential=True),)
+    assert {*rights_of(with_settings(OPTIONS, settings))} == {
+        rights_from("a:scheduling=fifo:9,essential=no"),
+        rights_from("c:nice=3,lock_memory=yes,oom_score_adjust=-100"),
+        rights_from("d:nice=5,essential=yes"),
+    }
 
 
 def test_questions() -> None:
-    rights = [parse_node_rights("a:essential"), parse_node_rights("b:essential=no")]
+    rights = [rights_from("a:essential=yes"), rights_from("b:essential=no")]
     assert essential_nodes(with_rights(OPTIONS, *rights)) == ("a",)
     assert not has_process_rights(rights)
-    assert has_process_rights([parse_node_rights("a:nice=0")])
-    assert [parse_node_rights(f"a:scheduling={s}").priority for s in ("rr:3", "idle")] == [3, 0]
+    assert has_process_rights([rights_from("a:nice=0")])
+    assert [rights_from(f"a:scheduling={s}").priority for s in ("rr:3", "idle")] == [3, 0]
 
 
 def test_nodes_that_can_have_rights() -> None:
-    rights = [parse_node_rights("ros:essential"), parse_node_rights("camera:nice=5")]
+    rights = [rights_from("ros:essential=yes"), rights_from("camera:nice=5")]
     check_rights_nodes(rights, {"camera"})
     with pytest.raises(DoraSystemdError, match="the node 'ros': something else starts it"):
-        check_rights_nodes([parse_node_rights("ros:nice=5")], {"camera"})
+        check_rights_nodes([rights_from("ros:nice=5")], {"camera"})
 
 
 @pytest.mark.parametrize("key", ["scheduling", "cpus", "lock_memory", "essential"])
@@ -137,19 +119,19 @@ def test_bad_values_of_nodes_name_file_and_key() -> None:
 
 def commands(*texts: str, base: Base | None = None) -> dict[str, str]:
     """The words of each node without their directory."""
-    rights = [parse_node_rights(text) for text in texts]
+    rights = [rights_from(text) for text in texts]
     found = rights_commands(rights, base or Base())
     return {node: " ".join(words).replace("/usr/bin/", "") for node, words in found.items()}
 
 
 def granted(*texts: str) -> list[str]:
-    properties = rights_properties([parse_node_rights(text) for text in texts])
+    properties = rights_properties([rights_from(text) for text in texts])
     return [line for slot in properties for line in format_property(slot, properties)]
 
 
 def test_nothing_without_rights() -> None:
     assert commands() == {}
-    assert commands("a:essential=no", "b:nice=0,oom-score-adjust=0") == {}
+    assert commands("a:essential=no", "b:nice=0,oom_score_adjust=0") == {}
     assert granted() == []
 
 
@@ -170,7 +152,7 @@ def test_priority_of_the_usual_kind() -> None:
     }
     assert granted("a:nice=-5", "b:nice=-20") == ["LimitNICE=40"]
     assert commands("a:scheduling=idle") == {"a": "chrt --idle 0", "*": ""}
-    assert granted("a:scheduling=idle,nice=5,oom-score-adjust=5,lock-memory") == []
+    assert granted("a:scheduling=idle,nice=5,oom_score_adjust=5,lock_memory=yes") == []
 
 
 def test_a_nice_value_is_that_of_the_node_and_not_added_to_that_of_the_unit() -> None:
@@ -178,15 +160,15 @@ def test_a_nice_value_is_that_of_the_node_and_not_added_to_that_of_the_unit() ->
 
 
 def test_memory() -> None:
-    assert commands("a:lock-memory")["a"] == "prlimit --memlock=unlimited:unlimited"
-    assert commands("a:oom-score-adjust=300") == {"a": "choom -n 300 --", "*": ""}
+    assert commands("a:lock_memory=yes")["a"] == "prlimit --memlock=unlimited:unlimited"
+    assert commands("a:oom_score_adjust=300") == {"a": "choom -n 300 --", "*": ""}
 
 
 def test_what_is_below_zero_is_for_one_node() -> None:
     """The whole unit has it; the others are raised again."""
-    assert granted("a:oom-score-adjust=-500", "b:oom-score-adjust=-9") == ["OOMScoreAdjust=-500"]
+    assert granted("a:oom_score_adjust=-500", "b:oom_score_adjust=-9") == ["OOMScoreAdjust=-500"]
     base = Base(oom=-500)
-    assert commands("a:oom-score-adjust=-500", "b:nice=1", base=base) == {
+    assert commands("a:oom_score_adjust=-500", "b:nice=1", base=base) == {
         "a": "",
         "b": "choom -n 0 -- nice -n 1",
         "*": "choom -n 0 --",
@@ -194,15 +176,15 @@ def test_what_is_below_zero_is_for_one_node() -> None:
 
 
 def test_memory_of_an_essential_node_goes_last() -> None:
-    assert commands("a:essential", "b:oom-score-adjust=7") == {
+    assert commands("a:essential=yes", "b:oom_score_adjust=7") == {
         "a": "",
         "b": "choom -n 7 --",
         "*": "choom -n 500 --",
     }
-    in_user_scope = commands("a:essential", base=Base(oom=200))
+    in_user_scope = commands("a:essential=yes", base=Base(oom=200))
     assert in_user_scope == {"a": "", "*": "choom -n 700 --"}
-    assert commands("a:essential", base=Base(oom=800))["*"] == "choom -n 1000 --"
-    both = commands("a:essential", "b:oom-score-adjust=-100", base=Base(oom=-100))
+    assert commands("a:essential=yes", base=Base(oom=800))["*"] == "choom -n 1000 --"
+    both = commands("a:essential=yes", "b:oom_score_adjust=-100", base=Base(oom=-100))
     assert both == {"a": "choom -n 0 --", "b": "", "*": "choom -n 500 --"}
 
 
@@ -222,6 +204,6 @@ def test_lines_of_the_launcher() -> None:
 
 
 def test_words_for_messages() -> None:
-    rights = parse_node_rights("a:scheduling=fifo:50,essential,lock-memory=no")
+    rights = rights_from("a:scheduling=fifo:50,essential=yes,lock_memory=no")
     assert described(rights) == "scheduling fifo:50, no lock_memory, essential"
     assert limits_of_others([rights]) == {"rtprio": 0}

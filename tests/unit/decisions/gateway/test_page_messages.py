@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.environment import changes_entry
-from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.options import parse_setting
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import (
@@ -26,6 +25,7 @@ from dora_systemd.decisions.gateway.page_messages import (
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped
 from dora_systemd.values import INFINITY
+from tests.unit.fakes.limit_values import limits_from
 from tests.unit.fakes.manager import options, with_limits, with_texts
 
 
@@ -36,8 +36,8 @@ def test_messages() -> None:
     text = '{"type": "act", "action": "set", "values": {"memory_limit": "6G", "hot_reload": "on"}}'
     values = {"memory_limit": "6G", "hot_reload": "on"}
     assert parse_message(text) == PageMessage("act", action="set", values=values)
-    text = '{"type": "act", "action": "set", "values": {"node_limit": "a:memory=2G"}}'
-    assert parse_message(text).values == {"node_limit": "a:memory=2G"}
+    text = '{"type": "act", "action": "set", "values": {"nodes": "a:memory_limit=2G"}}'
+    assert parse_message(text).values == {"nodes": "a:memory_limit=2G"}
     text = '{"type": "act", "action": "rollback", "dataflow": "u", "release": "2026"}'
     assert parse_message(text) == PageMessage("act", "u", action="rollback", release="2026")
     text = '{"type": "find", "search": "b\u00f6se", "run": "PREVIOUS", "since": "@7"}'
@@ -164,7 +164,7 @@ def facts(**unit: Any) -> dict[str, Any]:
 
 def test_a_dataflow_without_any() -> None:
     assert facts() == {
-        "node_limit": [],
+        "nodes": [],
         "hot_reload": False,
         "sandbox": "default",
         "network": "host",
@@ -179,12 +179,12 @@ def test_limits_are_what_set_takes() -> None:
 
 
 def test_changes_of_set_take_precedence() -> None:
-    limits = parse_node_limits("a:memory=1G,cpu=2")
+    limits = limits_from("a:memory_limit=1G,cpu_limit=2")
     own = with_limits(with_texts(options(), "hot_reload=yes"), limits)
     texts = ("a:memory_limit=2G", "b:tasks_limit=9", "c:tasks_limit=infinity", "hot_reload=no")
     changes = [changes_entry(map(parse_setting, texts))]
     found = fact_values(own, {**UNSET, "Environment": changes})
-    assert found["node_limit"] == ["a:cpu=200%,memory=2G", "b:tasks=9"]
+    assert found["nodes"] == ["a:cpu_limit=200%,memory_limit=2G", "b:tasks_limit=9"]
     assert found["hot_reload"] is False
     assert fact_values(own, UNSET)["hot_reload"] is True
 

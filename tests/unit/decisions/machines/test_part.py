@@ -69,8 +69,8 @@ def test_a_member_leaves_out_what_its_settings_say_of_other_machines() -> None:
     head, member = plan().options, plan(machine="gpu").options
     assert own_options(with_texts(head, "source:needs=/dev/video0")).has("needs")
     assert not own_options(with_texts(member, "source:needs=/dev/video0")).has("needs")
-    limits = node_limits("source", {"tasks": 1}), node_limits("mid", {"tasks": 2})
-    assert limits_of(own_options(with_limits(member, *limits))) == limits[1:]
+    limits = [node_limits(node, {"tasks_limit": 1}) for node in ("source", "mid")]
+    assert limits_of(own_options(with_limits(member, *limits))) == (limits[1],)
 
 
 def test_a_launch_file_starts_the_node_whatever_its_words_are(tmp_path: Path) -> None:

@@ -98,8 +98,10 @@ def test_what_a_member_is_told() -> None:
         },
         "memory_limit": "1G",
         "sandbox": "strict",
-        "nodes": {"yolo": {"memory_limit": "4G", "watchdog": "5s"}, "camera": {"cpu_limit": 1}},
-        "needs": ["camera=/dev/video0"],
+        "nodes": {
+            "yolo": {"memory_limit": "4G", "watchdog": "5s"},
+            "camera": {"cpu_limit": 1, "needs": "/dev/video0"},
+        },
     }
     options, members = spread_out(flow(on("gpu")), document, {"working_directory": "/srv/robot"})
     assert words_of(members) == (
@@ -130,7 +132,7 @@ def test_a_flag_overrides_the_host_only() -> None:
 
 
 def test_a_watchdog_of_all_nodes() -> None:
-    flags = {"machines": ("gpu=x",), "watchdog": ("5s",)}
+    flags = {"machines": ("gpu=x",), "watchdog": "5s"}
     options, members = spread_out(flow(on("gpu")), None, flags)
     assert "--set=watchdog=5s" in words_of(members)
     assert watchdogs_of(options) == {"": 5_000_000, "yolo": 0}
@@ -169,8 +171,11 @@ def test_modules_and_equal_hosts() -> None:
     [
         ({"hot_reload": True}, "hot reload"),
         ({"network": "private"}, "the network is private"),
-        ({"owes": ("yolo/out:within=2s",)}, "node yolo is on machine gpu, and owes"),
-        ({"needs": ("yolo=/dev/nvidia0",)}, "node yolo is on machine gpu, and waits for /dev/nv"),
+        ({"nodes": ("yolo:owes=out:within=2s",)}, "node yolo is on machine gpu, and owes"),
+        (
+            {"nodes": ("yolo:needs=/dev/nvidia0",)},
+            "node yolo is on machine gpu, and waits for /dev/nv",
+        ),
     ],
 )
 def test_what_works_on_one_machine_only(flags: dict[str, object], text: str) -> None:

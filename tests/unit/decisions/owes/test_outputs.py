@@ -16,6 +16,7 @@ from dora_systemd.decisions.cell.owes import (
     check_owes,
     format_owed,
     is_probe,
+    owes_of,
     parse_owed,
 )
 from dora_systemd.decisions.cell.restarts import RestartPolicy
@@ -25,19 +26,18 @@ from dora_systemd.decisions.owes.probe import (
     probe_definition,
     size_of_times,
 )
-from dora_systemd.decisions.settings.owes import OWES, merged_owes
-from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.settings.resolve import resolve_settings, with_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.decisions.cell.test_launch import plan
-from tests.unit.fakes.manager import with_owes
+from tests.unit.fakes.manager import options, with_owes
 
 CAMERA = Owed("camera", "image", 2 * SECOND)
 
 
 def owes(document: object, *flags: str) -> tuple[Owed, ...]:
-    found = resolve_settings({"owes": flags}, {}, [("/srv/robot.systemd.yml", document)])
-    return merged_owes(found.by_node(OWES), found[OWES])
+    found = resolve_settings({"nodes": flags}, {}, [("/srv/robot.systemd.yml", document)])
+    return owes_of(with_settings(options(), found))
 
 
 def test_from_settings() -> None:
@@ -47,12 +47,13 @@ def test_from_settings() -> None:
     # Who allows a minute between two messages allows it for the first one too.
     depth = Owed("camera", "depth", 60 * SECOND, 60 * SECOND, "fail")
     assert owes({"nodes": {"camera": {"owes": two}}}) == (CAMERA, depth)
-    assert owes({"owes": "camera/image:within=2s"}) == (CAMERA,)
-    assert owes({}, "camera/op/image:within=2s,first=1s,then=warn") == (
+    assert owes({"nodes": {"camera": {"owes": "image:within=2s"}}}) == (CAMERA,)
+    assert owes({}, "camera:owes=op/image:within=2s,first=1s,then=warn") == (
         Owed("camera", "op/image", 2 * SECOND, SECOND, "warn"),
     )
-    # A flag replaces what the file says of the same output.
-    changed = owes({"nodes": {"camera": {"owes": two}}}, "camera/image:within=5s")
+    # A flag replaces what the file has for that node.
+    flags = ("camera:owes=image:within=5s", "camera:nice=5,owes=depth:within=1min,then=fail")
+    changed = owes({"nodes": {"camera": {"owes": one}}}, *flags)
     assert changed == (CAMERA._replace(within=5 * SECOND), depth)
 
 
@@ -68,10 +69,10 @@ def test_from_settings() -> None:
         ({"output": "image", "within": "2s", "first": "soon"}, "first is 'soon'", "with its unit"),
         ({"output": "image", "within": "2s", "then": "restrat"}, "'restrat'", "mean restart?"),
         ({"output": "image", "withn": "2s"}, "unknown key 'withn'", "did you mean within"),
-        ("image", "'image' is none", "write NODE/OUTPUT:within=TIME"),
-        ("camera/image", "'camera/image' is none", "within is required"),
-        ("camera/image:2s", "is none", "write NODE/OUTPUT:within=TIME"),
-        ("camera/image:within=2s", "below the node 'camera' as owes", "write {output: NAME"),
+        ("image", "'image' is none", "write OUTPUT:within=TIME"),
+        (":within=2s", "':within=2s' is none", "within is required"),
+        ("image:2s", "is none", "write OUTPUT:within=TIME"),
+        ("image:first=2s", "within which time image has to come", "write within: 2s"),
     ],
 )  # fmt: skip
 def test_bad_values_of_a_node(value: object, message: str, hint: str) -> None:
@@ -83,12 +84,12 @@ def test_bad_values_of_a_node(value: object, message: str, hint: str) -> None:
 
 
 def test_the_dataflow_itself_owes_nothing() -> None:
-    with pytest.raises(DoraSystemdError, match="the output 'image' without its node"):
+    with pytest.raises(DoraSystemdError, match="unknown key 'owes'"):
         owes({"owes": {"output": "image", "within": "2s"}})
     with pytest.raises(DoraSystemdError, match="of another type"):
-        owes({"owes": 5})
-    with pytest.raises(DoraSystemdError, match=r"\(--owes\)"):
-        owes({}, "camera/image")
+        owes({"nodes": {"camera": {"owes": 5}}})
+    with pytest.raises(DoraSystemdError, match=r"\(--node camera:owes\)"):
+        owes({}, "camera:owes=image")
 
 
 TIMES = some.integers(SHORTEST, INFINITY - 1)
@@ -97,7 +98,7 @@ NAMES = some.from_regex(r"[a-z_/:.-]{1,9}", fullmatch=True)
 
 @given(NAMES, TIMES, TIMES, some.sampled_from(THEN))
 def test_the_command_line_has_it_exactly(output: str, within: int, first: int, then: str) -> None:
-    owed = Owed("camera", output, within, first, then)
+    owed = Owed("", output, within, first, then)
     assert parse_owed(format_owed(owed)) == owed
 
 

@@ -22,7 +22,7 @@ def test_nothing() -> None:
 
 def test_limits_of_nodes() -> None:
     before = {"nodes": {"a": {"memory_limit": "1G", "cpu_weight": 50}, "b": {"cpu_limit": 1}}}
-    after = {"nodes": {"a": {"memory_limit": "2G"}}, "node_limit": ["c:tasks=9"]}
+    after = {"nodes": {"a": {"memory_limit": "2G"}, "c": {"tasks_limit": 9}}}
     limits, others = change(before, after)
     assert limits == [
         *("a:memory_limit=2G", "a:cpu_weight=100"),

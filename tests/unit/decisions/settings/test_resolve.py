@@ -16,6 +16,7 @@ from dora_systemd.decisions.recorder.record import Record
 from dora_systemd.decisions.reload.changes import REPLACE_WORDS
 from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
 from dora_systemd.decisions.settings.machines import Declared
+from dora_systemd.decisions.settings.nodes import nodes_setting
 from dora_systemd.decisions.settings.resolve import (
     DEFAULT_SOURCE,
     Settings,
@@ -29,6 +30,7 @@ from dora_systemd.decisions.settings.table import (
     ENV_FILE,
     EXIT_WHEN_NODES_FINISH,
     GRACE_DURATION,
+    NODES,
     PROPERTY,
     SETTINGS,
     USER,
@@ -39,7 +41,7 @@ from dora_systemd.decisions.settings.table import (
 from dora_systemd.decisions.watchdog.watchdogs import SHORTEST
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
-from tests.unit.fakes.limit_values import LIMIT_VALUES, RESTART_VALUES
+from tests.unit.fakes.limit_values import IDS, LIMIT_VALUES, RESTART_VALUES
 from tests.unit.fakes.rights_values import RIGHTS_VALUES
 
 BESIDE = "/srv/robot.systemd.yml"
@@ -224,13 +226,9 @@ def test_values_and_back(data: st.DataObject) -> None:
         "on_failure": st.just(("/bin/x", "a b", "$c")) | st.just(("unit:tell@.service",)),
         "black_box": st.sampled_from([None, BlackBox(), BlackBox(2, 8 << 20)]),
         "record": st.sampled_from([None, Record(), Record(SECOND, 1 << 20, ("cam/image",))]),
-        "owes": st.just((Owed("cam", "image", 2 * SECOND),)) | st.just(()),
-        "log_rate_limit": st.dictionaries(
-            st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
-        ),
-        "watchdog": st.dictionaries(
-            st.sampled_from(["", "cam"]), st.just(INFINITY) | st.integers(SHORTEST, 2**60)
-        ),
+        "owes": st.just((Owed("", "image", 2 * SECOND),)) | st.just(()),
+        "log_rate_limit": st.none() | st.just(RateLimit(5, SECOND)),
+        "watchdog": st.just(INFINITY) | st.integers(SHORTEST, 2**60),
         "sandbox": st.sampled_from(LEVELS),
         "network": st.sampled_from(NETWORKS),
         "writable": st.lists(texts).map(tuple),
@@ -243,11 +241,15 @@ def test_values_and_back(data: st.DataObject) -> None:
         **LIMIT_VALUES,
         **RESTART_VALUES,
         **RIGHTS_VALUES,
-        "needs": st.sampled_from([("network",), ("mount:/mnt/x", "cam=/dev/video0")]),
+        "needs": st.sampled_from([("network",), ("mount:/mnt/x", "clock")]),
         "watch": st.just(("*.py", "config/*")),
         "ignore": st.just(("draft_*",)),
         "replace": st.sampled_from(REPLACE_WORDS),
     }
+    of_nodes = {one.name for one in SETTINGS if one.per_node} & examples.keys() - {"needs"}
+    values = st.fixed_dictionaries({}, optional={name: examples[name] for name in of_nodes})
+    values = values.map(lambda found: {key: value for key, value in found.items() if value != ()})
+    examples["nodes"] = st.dictionaries(IDS, values.filter(bool), max_size=2)
     for setting in SETTINGS:
         strategy = st.booleans() if setting.kind.is_flag else examples.get(setting.name, texts)
         value = data.draw(strategy, label=setting.name)
@@ -285,7 +287,8 @@ PACE = Setting[int]("pace", DURATION, 5, "A pace.", ("--pace",), "DORA_PACE", "T
 
 
 def test_a_new_setting_is_one_declaration() -> None:
-    table = (*SETTINGS, MODE, PACE)
+    own = (*(one for one in SETTINGS if one is not NODES), MODE, PACE)
+    table = (*own, nodes_setting(own))
     document = {"mode": "a", "nodes": {"camera": {"mode": "b", "pace": "1s"}, "detector": None}}
     user = {"nodes": {"camera": {"mode": "c", "pace": "2s"}, "other": {"pace": 3}}}
     settings = resolve_settings({}, {}, [(BESIDE, document), (HOME, user)], table)

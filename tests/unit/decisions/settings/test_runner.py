@@ -170,23 +170,23 @@ def test_who_restarts_nodes_and_who_watches_them() -> None:
 
 
 def test_members_watch_no_outputs() -> None:
-    head, words, _ = spread("owes", "/image:within=2s")
+    head, words, _ = spread("owes", "image:within=2s")
     assert words == []
     assert head.by_node("owes").keys() == {"camera"}
 
 
 def test_values_of_a_flag_that_names_nodes_are_those_of_the_nodes() -> None:
     given = {
-        "node_rights": ("camera:nice=5,essential", "arm:scheduling=idle"),
-        "owes": "camera/image:within=2s",
+        "nodes": ("camera:nice=5,essential=yes", "arm:scheduling=idle"),
     }
-    beside = {"nice": 3, "nodes": {"camera": {"nice": 9, "owes": {"output": "d", "within": "9s"}}}}
+    owes = ({"output": "d", "within": "9s"}, {"output": "image", "within": "2s"})
+    beside = {"nice": 3, "nodes": {"camera": {"nice": 9, "owes": [*owes]}}}
     settings = resolve_settings(given, {}, [("/srv/robot.systemd.yml", beside)])
     options = with_settings(OPTIONS, settings)
     assert [one.partition("=")[2] for one in format_runner_argv(options) if "--set" in one] == [
         "camera:nice=5",
-        "camera:owes=/d:within=9s,first=30s,then=restart",
-        "camera:owes=/image:within=2s,first=30s,then=restart",
+        "camera:owes=d:within=9s,first=30s,then=restart",
+        "camera:owes=image:within=2s,first=30s,then=restart",
         "camera:essential=yes",
         "arm:scheduling=idle",
     ], "the nice value for all is a property of the unit"

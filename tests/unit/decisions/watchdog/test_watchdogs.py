@@ -10,12 +10,11 @@ from dora_systemd.decisions.watchdog.watchdogs import (
     ALL_NODES,
     OFF,
     check_watchdogs,
-    format_watchdogs,
     parse_watchdog,
     watchdog_of,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.values import INFINITY, SECOND, format_duration
 from tests.unit.fakes.manager import options as runner_options
 from tests.unit.fakes.manager import with_texts
 
@@ -25,9 +24,10 @@ OPTIONS = runner_options()
 MACHINES = OPTIONS._replace(placed=(Placed("yolo", "gpu"),))
 
 
-def given(document: object, options: RunnerOptions = OPTIONS, **flags: object) -> list[str]:
-    settings = resolve_settings(flags, {}, [("/srv/robot.systemd.yml", document)])
-    return format_watchdogs(watchdogs_of(with_settings(options, settings)))
+def given(document: object, options: RunnerOptions = OPTIONS, *nodes: str) -> list[str]:
+    settings = resolve_settings({"nodes": nodes}, {}, [("/srv/robot.systemd.yml", document)])
+    found = watchdogs_of(with_settings(options, settings)).items()
+    return [f"{node}={format_duration(time)}".removeprefix("=") for node, time in found]
 
 
 @pytest.mark.parametrize("text", ["5", "0", "-1s", "199ms", "0.1s", "soon", "", "5 gigs", "1 5"])
@@ -47,7 +47,8 @@ def test_who_has_one() -> None:
     assert given({"watchdog": "5s", "nodes": {"cam": {"watchdog": "infinity"}}}) == ["5s", "cam=0"]
     both = {"watchdog": "infinity", "notify": True}
     assert given({"watchdog": "5s", "nodes": {"cam": both}}) == ["5s", "cam=infinity"]
-    assert given({"nodes": {"cam": {"watchdog": "5s"}}}, watchdog=["cam=2s"]) == ["cam=2s"]
+    of_file = {"nodes": {"cam": {"watchdog": "5s"}}}
+    assert given(of_file, OPTIONS, "cam:watchdog=2s") == ["cam=2s"]
     assert given({"notify": True, "nodes": {"cam": {"notify": False}}}) == ["infinity", "cam=0"]
 
 
@@ -62,11 +63,6 @@ def test_nodes_of_other_machines_have_none_here() -> None:
     assert watchdogs_of(of_all) == {ALL_NODES: 5 * SECOND, "yolo": OFF}
     assert watchdogs_of(of_all._replace(machine="gpu")) == {ALL_NODES: 5 * SECOND}
     assert watchdogs_of(with_texts(MACHINES, "cam:watchdog=5s")) == {"cam": 5 * SECOND}
-
-
-def test_a_node_names_no_other() -> None:
-    with pytest.raises(DoraSystemdError, match="'lidar=5s' as watchdog of node cam"):
-        given({"nodes": {"cam": {"watchdog": "lidar=5s"}}})
 
 
 def test_the_time_of_one_node() -> None:

@@ -258,7 +258,7 @@ def test_what_a_failed_node_says() -> None:
 def test_memory() -> None:
     text = format_report(Report(SUBJECT, judge(*RUNS, OOM, NODE_FAILED)))
     assert "Memory:   peak 300M, limit 300M\n" in text
-    assert "doractl set robot --node-limit camera:memory=SIZE" in text
+    assert "doractl set robot --node camera:memory_limit=SIZE" in text
 
 
 def test_memory_of_the_dataflow() -> None:
@@ -456,7 +456,7 @@ def test_what_to_do_is_whole_at_any_width(width: int) -> None:
     assert lines[0].endswith(": Failed")
     whole = " ".join(text.partition("What to do:")[2].split())
     assert "find the leak in camera, or run: doractl set" in whole
-    assert "--node-limit camera:memory=SIZE" in whole
+    assert "--node camera:memory_limit=SIZE" in whole
     assert UUID in text
 
 

@@ -103,7 +103,7 @@ The last 2 lines of camera (all: doractl logs robot --node camera):
   13:00:05  ... the same line, 3 times in all
 
 What to do:
-  find the leak in camera, or run: doractl set robot --node-limit camera:memory=SIZE; \
+  find the leak in camera, or run: doractl set robot --node camera:memory_limit=SIZE; \
 doractl advise robot proposes sizes by what was held before"""
     )
 

@@ -444,9 +444,7 @@ def test_how_a_stopped_node_ended() -> None:
 BY_HAND = "run: doractl restart {name}"
 AUTOMATIC = f"{BY_HAND}; --restart-policy on-failure does this automatically"
 SIZE = "; doractl advise {name} proposes sizes by what was held before"
-MORE_MEMORY = (
-    f"doractl set {{name}} --memory-limit SIZE, or limit single nodes (--node-limit){SIZE}"
-)
+MORE_MEMORY = f"doractl set {{name}} --memory-limit SIZE, or limit single nodes (--node){SIZE}"
 
 
 @pytest.mark.parametrize(
@@ -461,12 +459,12 @@ MORE_MEMORY = (
         (
             Verdict("Failed", Cause.NODE_OUT_OF_MEMORY, details={"owner": "machine"}),
             "the machine is short of memory: limit single nodes "
-            f"(--node-limit NODE:memory=SIZE){SIZE}",
+            f"(--node NODE:memory_limit=SIZE){SIZE}",
         ),
         (
             Verdict("Failed", Cause.NODE_OUT_OF_MEMORY, details={"owner": "node"}),
             "find the leak in {node}, or run: "
-            f"doractl set {{name}} --node-limit {{node}}:memory=SIZE{SIZE}",
+            f"doractl set {{name}} --node {{node}}:memory_limit=SIZE{SIZE}",
         ),
         (
             Verdict("Failed", Cause.NODE_FAILED, details={"exit": "signal SIGKILL"}),

@@ -65,7 +65,7 @@ def test_remedies() -> None:
         "as root: echo 0-1 > /proc/irq/142/smp_affinity_list",
         "keep other processes away from cpus 2-3: AllowedCPUs= in their units, see "
         "systemd.resource-control(5)",
-        "raise its CPU limit: doractl set robot --node-limit arm:cpu=SHARE",
+        "raise its CPU limit: doractl set robot --node arm:cpu_limit=CORES",
         "give arm CPUs of its own: cpus: below nodes: in its settings",
         "raise its CPU limit: doractl set robot --cpu-limit SHARE",
     ]

@@ -11,7 +11,6 @@ import pytest
 from dora_systemd.adapters.cgroup.groups import SUPERVISOR, group_of
 from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN
-from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
@@ -30,6 +29,7 @@ from dora_systemd.runner.cell.begin import (
     start_daemon,
 )
 from tests.unit.fakes.cgroups import fake_cgroups
+from tests.unit.fakes.limit_values import limits_from
 from tests.unit.fakes.manager import options, with_limits, with_texts
 from tests.unit.fakes.programs import make_program
 
@@ -168,10 +168,10 @@ def test_nodes_have_what_a_prompt_has(monkeypatch: pytest.MonkeyPatch, home: str
 
 
 def test_cpus_of_a_node_are_told_where_no_cgroup_binds_it(paths: CellPaths, tmp_path: Path) -> None:
-    bound = with_limits(options(), parse_node_limits("a:cpus=0"))
+    bound = with_limits(options(), limits_from("a:cpus=0"))
     told = daemon_variables(bound, paths, tmp_path, {})["DORA_SYSTEMD_RIGHTS"]
     assert told == "a /usr/bin/taskset -c 0\n* \n"
-    limited = with_limits(options(), parse_node_limits("a:memory=1G"))
+    limited = with_limits(options(), limits_from("a:memory_limit=1G"))
     assert "DORA_SYSTEMD_RIGHTS" not in daemon_variables(limited, paths, tmp_path, {})
 
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.decisions.cell.rights import parse_node_rights
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants, raise_file_limit
 from tests.unit.adapters.logs.test_queue import SlowJournal
+from tests.unit.fakes.rights_values import rights_from
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_only_a_node_without_a_launcher_is_lowered_from_outside(
     tmp_path: Path, raw: dict[str, object], is_lowered: bool
 ) -> None:
     """The launcher of an operator takes the limits by itself, once it has used them."""
-    rights = (parse_node_rights("b:essential"),)
+    rights = (rights_from("b:essential=yes"),)
     (tmp_path / "io").mkdir()
 
     def score(child: subprocess.Popen[bytes]) -> int:

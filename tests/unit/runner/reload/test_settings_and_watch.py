@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
-from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates, rates_of
+from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rate, rates_of
 from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -155,17 +155,18 @@ def test_hot_reload_takes_over_nothing_by_being_switched_on(tmp_path: Path) -> N
 
 def test_limits_of_lines(tmp_path: Path) -> None:
     """They hold for the nodes that run, for those that a reload adds, and for the next run."""
-    rates = parse_rates(["9/1s", "a=infinity"])
+    rates = {"": parse_rate("9/1s"), "a": None}
+    limits = ["log_rate_limit=9/1s", "a:log_rate_limit=infinity"]
 
     async def work() -> None:
         bench = Bench(tmp_path)
         for begin in (lambda: None, bench.begin):
             begin()
-            await bench.reloader.answer({"verb": "log-rates", "limits": ["9/1s", "a=infinity"]})
+            await bench.reloader.answer({"verb": "log-rates", "limits": limits})
             assert rates_of(bench.reloader.options) == rates
         assert bench.limited == [rates]
         with pytest.raises(DoraSystemdError, match="cannot read 'x' as a rate"):
-            await bench.reloader.answer({"verb": "log-rates", "limits": ["x"]})
+            await bench.reloader.answer({"verb": "log-rates", "limits": ["log_rate_limit=x"]})
         assert rates_of(bench.reloader.options) == rates
         bench.reloader.close()
 

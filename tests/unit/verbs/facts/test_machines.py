@@ -50,6 +50,8 @@ def test_limits_of_a_node_elsewhere() -> None:
     manager.add(options("robot", placed=PLACED))
     (cell,) = read_cells(manager)
     with pytest.raises(DoraSystemdError, match="node yolo: it runs on machine gpu"):
-        set_limits(manager, scope, cell, {"node_limit": ("yolo:memory=1G",)})
+        set_limits(manager, scope, cell, {"nodes": ("yolo:memory_limit=1G",)})
     with pytest.raises(DoraSystemdError, match="node arm: it runs on machine pi"):
-        set_limits(manager, scope, cell, {"log_rate_limit": ("9/1s", "arm=1/1s")})
+        set_limits(
+            manager, scope, cell, {"log_rate_limit": "9/1s", "nodes": "arm:log_rate_limit=1/1s"}
+        )

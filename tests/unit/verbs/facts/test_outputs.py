@@ -7,9 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.owes import Owed
-from dora_systemd.decisions.cell.rights import parse_node_rights
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.views.facts import OutputRow
 from dora_systemd.scope import Scope
@@ -17,7 +15,9 @@ from dora_systemd.trust.files import read_times
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import dataflow_row
+from tests.unit.fakes.limit_values import limits_from
 from tests.unit.fakes.manager import FakeManager, options, with_limits, with_owes, with_rights
+from tests.unit.fakes.rights_values import rights_from
 from tests.unit.verbs.facts.test_list import GROUP, scope, unit_group, write_status
 
 __all__ = ["scope", "unit_group"]
@@ -49,7 +49,7 @@ def test_cpus(scope: Scope, unit_group: Path, now: str) -> None:
     if now:
         (unit_group / "node-camera/cpuset.cpus").write_text(now)
     manager = FakeManager()
-    limits = (parse_node_limits("camera:cpus=2-3"), parse_node_limits("plot:memory=1G"))
+    limits = (limits_from("camera:cpus=2-3"), limits_from("plot:memory_limit=1G"))
     manager.add(with_limits(options(), *limits), ControlGroup=GROUP)
     nodes = {one: NodeStatus("running") for one in ("camera", "plot", "ui")}
     write_status(scope, CellStatus(nodes=nodes))
@@ -83,7 +83,7 @@ def test_other_files_in_its_place(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("unit_group")
 def test_what_is_special_about_nodes(scope: Scope) -> None:
     manager = FakeManager()
-    rights = (parse_node_rights("camera:essential,scheduling=batch"),)
+    rights = (rights_from("camera:essential=yes,scheduling=batch"),)
     manager.add(with_rights(options(), *rights), ControlGroup=GROUP)
     nodes = {one: NodeStatus("running") for one in ("camera", "plot")}
     write_status(scope, CellStatus(nodes=nodes))

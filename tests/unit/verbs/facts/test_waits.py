@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.host.interrupts import Interrupts
-from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.resources.rivals import Rival
 from dora_systemd.decisions.why.waits import MINUTE, CpuWait
 from dora_systemd.scope import Scope
@@ -15,6 +14,7 @@ from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reading import read_dataflow
 from dora_systemd.verbs.facts.waits import read_cpu_waits, shared_interrupts
 from tests.unit.fakes.cgroups import fake_cgroups
+from tests.unit.fakes.limit_values import limits_from
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options, with_limits, with_texts
 
 GROUP = "/dora.slice/dora-robot.service"
@@ -62,7 +62,7 @@ def use_cpu(proc: Path, seconds: float) -> None:
 def waits(scope: Scope, proc: Path, cpus: str = "") -> tuple[CpuWait, ...]:
     runner = with_texts(options(), "camera:needs=/dev/null", "camera:needs=/etc/passwd")
     if cpus:
-        runner = with_limits(runner, parse_node_limits(f"camera:cpus={cpus}"))
+        runner = with_limits(runner, limits_from(f"camera:cpus={cpus}"))
     manager = FakeManager()
     manager.add(runner, ControlGroup=GROUP)
     (cell,) = read_cells(manager)
@@ -126,7 +126,7 @@ def test_interrupts_of_settings(tmp_path: Path) -> None:
         path.write_text(text)
     (tmp_path / "sys/class/net/can0").symlink_to(device)
     needing = with_texts(options(), "arm:needs=net:can0", "camera:needs=net:can0")
-    bound = with_limits(needing, *map(parse_node_limits, ("arm:cpus=0", "camera:cpus=1")))
+    bound = with_limits(needing, *map(limits_from, ("arm:cpus=0", "camera:cpus=1")))
     (one,) = shared_interrupts(Interrupts(tmp_path), bound)
     assert (one.node, one.needs, one.numbers, one.elsewhere) == ("arm", "net:can0", (7,), "1")
     assert list(shared_interrupts(Interrupts(tmp_path), needing)) == []

@@ -256,19 +256,19 @@ def test_an_absolute_link_to_a_file_of_the_project(bench: Bench) -> None:
 
 
 def test_options_that_are_not_given_again_are_named(bench: Bench) -> None:
-    rates = ("20/1s", "a=10/1s")
-    flags = {"nice": "3", "exit_when_nodes_finish": False, "log_rate_limit": rates}
+    nodes = ("a:log_rate_limit=10/1s",)
+    flags = {"nice": "3", "exit_when_nodes_finish": False, "nodes": nodes}
     first = bench.deploy(env=("KEY=secret",), **flags)  # type: ignore[arg-type]
     assert bench.store.manifest(first.release).given == {
         **{"dora": bench.dora, "env": ["KEY=secret"], "exit_when_nodes_finish": "no"},
-        **{"nice": "3", "log_rate_limit": [*rates]},
+        **{"nice": "3", "nodes": [*nodes]},
     }
     assert bench.warnings == []
     bench.write("dataflow.systemd.yml", "env: {KEY: other}\n")
     bench.deploy(nice="4")
     assert bench.warnings == [
         f"options of release {first.release} are not given any more: "
-        "--no-exit-when-nodes-finish, --log-rate-limit 20/1s, --log-rate-limit a=10/1s; "
+        "--no-exit-when-nodes-finish, --node a:log_rate_limit=10/1s; "
         "give them again, or write them to dataflow.systemd.yml, to keep them"
     ]
     bench.deploy(nice="4")

@@ -299,9 +299,9 @@ RAISING = {
     "nodes: {a: {nice: -1}}": "nodes.a.nice",
     "nodes: {a: {nice: 5, oom_score_adjust: -1}}": "nodes.a.oom_score_adjust",
     "nodes: {b: {essential: true}, a: {lock_memory: true}}": "nodes.a.lock_memory",
-    "node_rights: ['a:nice=1', 'b:scheduling=rr:1']": "node_rights",
+    "nodes: {a: {nice: 1}, b: {scheduling: 'rr:1'}}": "nodes.b.scheduling",
     "nodes: {a: {nice: 5, scheduling: idle, essential: true, cpus: 0, lock_memory: no}}": "",
-    "node_rights: a:oom-score-adjust=9": "",
+    "nodes: {a: {oom_score_adjust: 9}}": "",
     "nice: -5": "nice",
     "needs: [network, ' unit:reboot.target']": "needs",
     "needs: mount:/srv": "needs",
@@ -325,7 +325,7 @@ def test_rights_that_only_root_gives(project: Path, text: str) -> None:
     assert caught.value.message == (
         f"cannot use {beside}: {RAISING[text]} is set there, and the file is not root's"
     )
-    flag = f"--{RAISING[text]}" if RAISING[text] in ("nice", "needs") else "--node-rights"
+    flag = f"--{RAISING[text]}" if RAISING[text] in ("nice", "needs") else "--node"
     assert caught.value.hint.startswith(f"give {flag} on the command line, or set it in ")
     assert caught.value.code is ExitCode.NO_PERMISSION
 
