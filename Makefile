@@ -117,6 +117,10 @@ forky:  ## the same on the next Debian, with systemd 262
 	@$(PREPARE) container
 	@$(CHECK) forky
 
+arm64:  ## the packages and wheels for arm64: built, installed and used, all emulated
+	@$(PREPARE) container
+	@$(CHECK) arm64
+
 canary:  ## what differs with the newest dora on PyPI, or with VERSION=
 	@$(PREPARE) container
 	@VERSION=$(VERSION) $(CHECK) canary
@@ -144,4 +148,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm emulator faults history stops power fuzz mutants browser openarm machines bench bench-quick bench-platforms bookworm forky canary lint demo clean deb wheels autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm emulator faults history stops power fuzz mutants browser openarm machines bench bench-quick bench-platforms bookworm forky arm64 canary lint demo clean deb wheels autopkgtest

@@ -1,7 +1,8 @@
 """`make wheels`: dora-systemd, and the two libraries of which PyPI has no wheels.
 
 pystemd and systemd-python are compiled, against the libsystemd that every machine with systemd has:
-each in a Debian with the Python it is for. uv and pipx find the rest on PyPI.
+each in a Debian with the Python it is for. uv and pipx find the rest on PyPI. `make arm64` has
+those of its Debian compiled in an emulator, for which arm64 stands in the place of a release.
 """
 
 import hashlib
@@ -9,11 +10,14 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from lab import definition
 from lab.cache import find_cache
 from lab.errors import LabError, Stage, say
+from lab.foreign import emulated, ensure_foreign_room
+from lab.options import FOREIGN
 from lab.platforms import COMPILED
 from lab.process import need_root
 
@@ -32,7 +36,8 @@ def main(suites: Sequence[str]) -> int:
         cache = find_cache()
         with tempfile.TemporaryDirectory(prefix="wheels-", dir=cache) as place:
             built = [build_wheels(cache, Path(place), suite) for suite in suites or SUITES]
-            deliver([wheel for one in built for wheel in sorted(one.glob("*.whl"))])
+            out = OUT.with_name(f"{OUT.name}-{FOREIGN}") if FOREIGN in suites else OUT
+            deliver([wheel for one in built for wheel in sorted(one.glob("*.whl"))], out)
     except LabError as error:
         print(error, file=sys.stderr)
         return 1
@@ -41,8 +46,7 @@ def main(suites: Sequence[str]) -> int:
 
 def build_wheels(cache: Path, place: Path, suite: str) -> Path:
     """The directory with the wheels for the Python of a release of Debian."""
-    # A kind for each, as the cache keeps two of a kind.
-    room = ensure_suite(cache, f"wheelroom.{suite}", suite, PACKAGES)
+    room = ensure_wheel_room(cache, suite)
     build = place / suite
     source = build / "dora-systemd"
     source.mkdir(parents=True)
@@ -50,19 +54,28 @@ def build_wheels(cache: Path, place: Path, suite: str) -> Path:
     settle(source, read_date(SOURCES[0]))
     command = ["pip", "wheel", "--no-deps", "--no-cache-dir", "--wheel-dir=wheels"]
     network = network_environment(build)
-    with Stage(f"wheels for the Python of Debian {suite}"):
+    emulator = emulated() if suite == FOREIGN else nullcontext()
+    with emulator, Stage(f"wheels for the Python of Debian {suite}"):
         words = [*command, "./dora-systemd", *COMPILED]
         run_in_room(room, build, words, network, has_network=True)
     return build / "wheels"
 
 
-def deliver(wheels: Sequence[Path]) -> None:
+def ensure_wheel_room(cache: Path, suite: str) -> Path:
+    """Where the wheels are built; a kind for each release, as the cache keeps two of a kind."""
+    kind = f"wheelroom.{suite}"
+    if suite == FOREIGN:
+        return ensure_foreign_room(cache, kind, PACKAGES)
+    return ensure_suite(cache, kind, suite, PACKAGES)
+
+
+def deliver(wheels: Sequence[Path], out: Path) -> None:
     """Put them where docs/install.md has uv look for them, with a file of checksums."""
-    shutil.rmtree(OUT, ignore_errors=True)
-    OUT.mkdir(parents=True)
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
     for wheel in wheels:
-        shutil.copy(wheel, OUT)
-    names = sorted(path.name for path in OUT.iterdir())
-    sums = [f"{hashlib.sha256((OUT / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
-    (OUT / "SHA256SUMS").write_text("".join(sums), encoding="ascii")
-    say(f"{len(names)} wheels, see {OUT}: {' '.join(names)}")
+        shutil.copy(wheel, out)
+    names = sorted(path.name for path in out.iterdir())
+    sums = [f"{hashlib.sha256((out / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
+    (out / "SHA256SUMS").write_text("".join(sums), encoding="ascii")
+    say(f"{len(names)} wheels, see {out}: {' '.join(names)}")

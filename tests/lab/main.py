@@ -13,11 +13,12 @@ from lab.container import run_in_container
 from lab.coredumps import ensure_with_coredump
 from lab.definition import PLATFORMS
 from lab.errors import LabError
+from lab.foreign import ensure_foreign, run_in_foreign
 from lab.image import ensure_tree
 from lab.machine import run_in_emulator, run_in_vm
 from lab.machines import run_in_machines
 from lab.openarm import ensure_openarm
-from lab.options import Options, parse_options
+from lab.options import FOREIGN, Options, parse_options
 from lab.process import need_root
 from lab.rivals import ensure_rivals
 from lab.runs import Guard, clean_dead_runs, close_run, open_run, opened_door
@@ -89,6 +90,7 @@ ENSURE: dict[str, Callable[[Path], Path]] = {
     "openarm": ensure_openarm,
     "machines": ensure_tree,
     **{suite: partial(ensure_with_coredump, suite=suite) for suite in PLATFORMS},
+    FOREIGN: ensure_foreign,
 }
 RUN = {
     "container": run_in_container,
@@ -99,6 +101,7 @@ RUN = {
     "openarm": run_in_container,
     "machines": run_in_machines,
     **dict.fromkeys(PLATFORMS, run_in_container),
+    FOREIGN: run_in_foreign,
 }
 VERBS = {
     "run": run_command,

@@ -9,7 +9,11 @@ from pathlib import Path
 from lab.definition import PLATFORMS
 from lab.errors import LabError
 
-FORMS = ("container", "vm", "emulator", *PLATFORMS, "rivals", "browser", "openarm", "machines")
+FOREIGN = "arm64"
+"""The processor whose programs can be run on this one, too."""
+
+_CONTAINERS = ("rivals", "browser", "openarm", "machines")
+FORMS = ("container", "vm", "emulator", *PLATFORMS, FOREIGN, *_CONTAINERS)
 
 MACHINES = ("vm", "emulator")
 
@@ -24,6 +28,7 @@ environment:
   LAB=bookworm      a container with Debian 12: systemd 252, Python 3.11; the checkout is not
                     installed, but all that its packages need is
   LAB=forky         a container with Debian forky, as bookworm: systemd 262, Python 3.14
+  LAB=arm64         a container with Debian 13 for arm64, each program of which is emulated: slow
   LAB=rivals        the container with supervisord, circus and pm2, for benchmarks
   LAB=browser       the container with Chromium, for the status page
   LAB=openarm       the container with nodes of OpenArm from PyPI

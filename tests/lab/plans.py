@@ -15,7 +15,7 @@ from lab.cache import find_cache
 from lab.changed import changed_rooms
 from lab.definition import CHECKOUT, NEW_SUITE, OLD_SUITE, PLATFORMS
 from lab.errors import LabError
-from lab.options import MACHINES
+from lab.options import FOREIGN, MACHINES
 from lab.process import need_root
 from lab.steps import Step, run_steps
 from lab.venv import add_package, ensure_venv, venv_environment, write_package
@@ -213,6 +213,14 @@ def plan_system(form: str) -> list[Step]:
     return [Step("system tests, this machine", command, partial(in_venv, for_system_tests=True))]
 
 
+def plan_foreign(_form: str) -> list[Step]:
+    """The packages and wheels for another processor, emulated: minutes, so by hand only."""
+    build = Step("Debian packages", ["packaging/build", "--once"], os.environ.copy, minutes=2)
+    wheels = Step("wheels", ["packaging/wheels", FOREIGN], os.environ.copy, minutes=5)
+    tests = lab_step(f"tests on {FOREIGN}", FOREIGN, ["tests/platforms/foreign.py"], minutes=5)
+    return [build, wheels, replace(tests, after=(build.name, wheels.name))]
+
+
 def plan_browser(_form: str) -> list[Step]:
     arguments = ["tests/system", "-m", "browser"]
     return [lab_step("status page in a browser", "browser", arguments, minutes=1)]
@@ -383,6 +391,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "emulator": plan_emulator,
     "packages": plan_packages,
     **{suite: partial(plan_platform, suite=suite) for suite in PLATFORMS},
+    FOREIGN: plan_foreign,
     "browser": plan_browser,
     "openarm": plan_openarm,
     "machines": plan_machines,
