@@ -140,9 +140,9 @@ deb:  ## the Debian packages, built twice and checked, into dist/
 	@$(PREPARE) container
 	@packaging/build
 
-wheels:  ## wheels of dora-systemd, pystemd and systemd-python, into dist/wheels, for uv and pipx
+wheels:  ## wheels of dora-systemd, pystemd and systemd-python, into dist/wheels, for uv and pipx; PYTHON=DIR
 	@$(PREPARE) container
-	@packaging/wheels
+	@packaging/wheels $(PYTHON)
 
 autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has built
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)

@@ -2,7 +2,9 @@
 
 pystemd and systemd-python are compiled, against the libsystemd that every machine with systemd has:
 each in a Debian with the Python it is for. uv and pipx find the rest on PyPI. `make arm64` has
-those of its Debian compiled in an emulator, for which arm64 stands in the place of a release.
+those of its Debian compiled in an emulator, for which arm64 stands in the place of a release. In
+its place can stand the directory of a Python that no lab has, such as uv's: that is
+copied into the oldest Debian.
 """
 
 import hashlib
@@ -29,14 +31,14 @@ PACKAGES = ("libsystemd-dev", "pkgconf", "python3-dev", "python3-pip", "python3-
 OUT = CHECKOUT / "dist/wheels"
 
 
-def main(suites: Sequence[str]) -> int:
-    """Build the wheels in these releases of Debian, or in those of the labs; the exit status."""
+def main(targets: Sequence[str]) -> int:
+    """Build the wheels for these targets, or for the Pythons of the labs; the exit status."""
     try:
         need_root()
         cache = find_cache()
         with tempfile.TemporaryDirectory(prefix="wheels-", dir=cache) as place:
-            built = [build_wheels(cache, Path(place), suite) for suite in suites or SUITES]
-            out = OUT.with_name(f"{OUT.name}-{FOREIGN}") if FOREIGN in suites else OUT
+            built = [build_wheels(cache, Path(place), one) for one in targets or SUITES]
+            out = OUT.with_name(f"{OUT.name}-{FOREIGN}") if FOREIGN in targets else OUT
             deliver([wheel for one in built for wheel in sorted(one.glob("*.whl"))], out)
     except LabError as error:
         print(error, file=sys.stderr)
@@ -44,18 +46,22 @@ def main(suites: Sequence[str]) -> int:
     return 0
 
 
-def build_wheels(cache: Path, place: Path, suite: str) -> Path:
-    """The directory with the wheels for the Python of a release of Debian."""
-    room = ensure_wheel_room(cache, suite)
-    build = place / suite
+def build_wheels(cache: Path, place: Path, target: str) -> Path:
+    """The directory with the wheels for the Python of a release of Debian, or for another one."""
+    is_other = "/" in target
+    room = ensure_wheel_room(cache, definition.OLD_SUITE if is_other else target)
+    build = place / Path(target).name
     source = build / "dora-systemd"
     source.mkdir(parents=True)
     copy_files(CHECKOUT, source, list_checkout())
     settle(source, read_date(SOURCES[0]))
-    command = ["pip", "wheel", "--no-deps", "--no-cache-dir", "--wheel-dir=wheels"]
+    if is_other:
+        shutil.copytree(target, build / "python", symlinks=True)
+    program = "python/bin/python3" if is_other else "python3"
+    command = [program, "-m", "pip", "wheel", "--no-deps", "--no-cache-dir", "--wheel-dir=wheels"]
     network = network_environment(build)
-    emulator = emulated() if suite == FOREIGN else nullcontext()
-    with emulator, Stage(f"wheels for the Python of Debian {suite}"):
+    emulator = emulated() if target == FOREIGN else nullcontext()
+    with emulator, Stage(f"wheels for the Python of {target}"):
         words = [*command, "./dora-systemd", *COMPILED]
         run_in_room(room, build, words, network, has_network=True)
     return build / "wheels"
