@@ -1,7 +1,8 @@
 """The main process of a dataflow's unit: `python3 -m dora_systemd.runner`, started by systemd.
 
-Its exit status is RunnerExit in decisions/life/states.py. This module starts the coordinator before
-it imports the rest of the runner: the imports take longer than the coordinator takes to listen.
+Its exit status is RunnerExit in decisions/life/runner_exit.py. This module starts the coordinator
+before it imports the rest of the runner: the imports take longer than the coordinator takes to
+listen.
 """
 
 import contextlib

@@ -33,7 +33,8 @@ from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.refusal import refusal_exit
-from dora_systemd.decisions.life.states import Cell, RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator
 
-from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.views.dataflows import UP_WORDS
 from tests.history.history import Answer, CellView, History, Look
 from tests.history.steps import CELLS, COMMANDS, Step, Wish

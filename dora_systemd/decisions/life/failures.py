@@ -7,7 +7,15 @@ from typing import Any
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import (
+    Action,
+    Cell,
+    Deadline,
+    Do,
+    Record,
+    State,
+)
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.values import SECOND
 

@@ -29,13 +29,13 @@ from dora_systemd.decisions.life.failures import (
     oom_of_all,
     to,
 )
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import (
     Action,
     Cell,
     Deadline,
     Do,
     Record,
-    RunnerExit,
     State,
     StopStep,
 )

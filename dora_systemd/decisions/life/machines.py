@@ -25,13 +25,13 @@ from dora_systemd.decisions.life.failures import (
     fail,
     to,
 )
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import (
     Action,
     Cell,
     Deadline,
     Do,
     Record,
-    RunnerExit,
     State,
 )
 from dora_systemd.decisions.life.stop_budget import ANSWER_MARGIN, LEAVE_TIMEOUT, stop_timeout

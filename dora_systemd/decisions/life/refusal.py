@@ -6,7 +6,7 @@ have another program in the runner's place, so the text is cleaned and cut, and 
 """
 
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
-from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.errors import DoraSystemdError, ExitCode, RestartsSpent, TimedOut
 from dora_systemd.terminal_text import short_line
 

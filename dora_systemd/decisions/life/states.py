@@ -2,31 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum, IntEnum
+from enum import Enum
 from typing import TYPE_CHECKING
 
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 
-if TYPE_CHECKING:  # doractl needs only RunnerExit
+if TYPE_CHECKING:
     from dora_systemd.decisions.cell.status import NodeStatus
     from dora_systemd.decisions.cell.stops import Stops
     from dora_systemd.decisions.descriptor.dataflow import Downstream
-
-
-class RunnerExit(IntEnum):
-    """Exit status of the runner, which systemd shows as ExecMainStatus; see sysexits(3head)."""
-
-    OK = 0
-    FAILED = 1
-    NO_MACHINE = 68
-    ENGINE_LOST = 69
-    NODES_FAILED = 70
-    FAILED_AT_STOP = 71
-    NO_DORA = 72
-    STOPPED_ON_MACHINE = 73
-    RESTARTS_SPENT = 75
-    NO_ACCESS = 77
-    BAD_DATAFLOW = 78
 
 
 class State(Enum):

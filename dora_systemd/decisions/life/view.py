@@ -15,7 +15,8 @@ from dora_systemd.decisions.cell.status import (
     is_stopped,
 )
 from dora_systemd.decisions.life.node_table import WITH_PROCESS, is_held_up, lacking
-from dora_systemd.decisions.life.states import Cell, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.life.stop_order import has_order, in_turn
 from dora_systemd.decisions.needs.waiting import format_wait

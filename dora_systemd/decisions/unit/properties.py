@@ -17,7 +17,7 @@ from dora_systemd.decisions.cell.options import (
 )
 from dora_systemd.decisions.cell.restarts import restart_of
 from dora_systemd.decisions.cell.rights import NICE_LIMIT, NodeRights, rights_of
-from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.stop_budget import unit_timeout
 from dora_systemd.decisions.needs.units import NETWORK_UNIT, device_entries, needs_properties
 from dora_systemd.decisions.properties.assignments import (

@@ -25,6 +25,7 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import (
     Action,
     Cell,
@@ -32,7 +33,6 @@ from dora_systemd.decisions.life.states import (
     Do,
     NodeAction,
     Record,
-    RunnerExit,
     State,
 )
 from dora_systemd.decisions.life.table import step

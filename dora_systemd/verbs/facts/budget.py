@@ -8,7 +8,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.decisions.cell.restarts import restart_of, unit_budget
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.views.dataflows import RESTARTING
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope

@@ -16,7 +16,7 @@ from dora_systemd.adapters.bus.manager import (
     is_at_rest,
     tell_stage,
 )
-from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.values import INFINITY, SECOND
 
 HELD: Property = ("AddRef", "b", True)

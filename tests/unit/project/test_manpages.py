@@ -12,7 +12,7 @@ from dora_systemd.adapters.host import files
 from dora_systemd.adapters.host.watch import IDLE_MS
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.decisions.gateway.place import ADDRESS_VARIABLE, PORT_VARIABLE
-from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.schema import validate_settings

@@ -15,7 +15,7 @@ import pytest
 
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.decisions.life.refusal import parse_refusal
-from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.releases.build import BuildTask, format_task
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.build import Output, ToJournal, ToReader, build, main

@@ -8,7 +8,8 @@ import pytest
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import HELD, LATCHED, RESTART, STOP, NodeStatus
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Cell, Do, Record, State
 from dora_systemd.decisions.life.table import step
 
 

@@ -8,7 +8,8 @@ from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, State
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import format_status
 from dora_systemd.values import SECOND

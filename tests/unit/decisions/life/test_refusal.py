@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.life.refusal import format_refusal, parse_refusal, refusal_exit
-from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.unit.properties import restart_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode, TimedOut
 from dora_systemd.verbs.start.start_unit import start_unit

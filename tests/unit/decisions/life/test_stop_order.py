@@ -8,6 +8,7 @@ from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import (
     Cell,
     Deadline,
@@ -16,7 +17,6 @@ from dora_systemd.decisions.life.states import (
     GiveTime,
     NodeAction,
     Record,
-    RunnerExit,
     State,
     StopNode,
 )

@@ -11,7 +11,15 @@ from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
-from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import (
+    Action,
+    Cell,
+    Deadline,
+    Do,
+    Record,
+    State,
+)
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.table import TABLE, step
 from dora_systemd.decisions.life.view import is_up

@@ -19,7 +19,8 @@ from dora_systemd.decisions.life.node_table import (
     update,
 )
 from dora_systemd.decisions.life.refusal import setup_failure
-from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, is_up

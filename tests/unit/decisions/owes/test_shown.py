@@ -4,7 +4,8 @@ from dora_systemd.decisions.cell.exits import Exit, ExitKind, parse_exit
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Cell, Do, Record, State
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status
 from dora_systemd.decisions.views.details import format_dataflow

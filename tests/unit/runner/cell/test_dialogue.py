@@ -13,7 +13,8 @@ import pytest
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Do, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.fakes.dialogue import DESCRIPTOR, Bench

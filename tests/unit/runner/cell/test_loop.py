@@ -16,7 +16,8 @@ from dora_systemd.decisions.cell.options import RunnerOptions, format_runner_arg
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora.protocol import Reply
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Cell, Do, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.dialogue import Dialogue

@@ -15,7 +15,8 @@ from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.decisions.life.states import Cell, Do, Record, State
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.cell.restarts import Life
