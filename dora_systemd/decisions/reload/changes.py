@@ -9,10 +9,6 @@ from typing import Any
 
 from dora_systemd.decisions.reload.watch_rules import WatchRules
 
-START_FIRST = "start-first"
-REPLACE_WORDS = ("stop-first", START_FIRST)
-"""What is first when a node gets another process: the end of the old one, or the start."""
-
 _EDGES = ("inputs", "outputs", "operator", "operators", "ros2")
 """Keys of a node that dora cannot change in place."""
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from dora_systemd.decisions.reload.changes import REPLACE_WORDS
+from dora_systemd.decisions.reload.swap_order import REPLACE_WORDS
 from dora_systemd.decisions.reload.watch_rules import (
     DEFAULT_WATCH,
     parse_patterns,

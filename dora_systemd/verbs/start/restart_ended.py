@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
-from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.journal_events import FORGOTTEN
-from dora_systemd.decisions.logs.query import request_matches
 from dora_systemd.decisions.settings.resolve import given_texts, is_given
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_uuid, is_uuid_prefix, unit_name
@@ -142,6 +140,9 @@ def _readable(scope: Scope, selector: Selector) -> Asked | None:
 
 
 def _refuse_released(scope: Scope, asked: Asked) -> None:
+    from dora_systemd.adapters.journal.reader import JournalReader
+    from dora_systemd.decisions.logs.query import request_matches
+
     name = f"DORA_DATAFLOW_NAME={asked.name}"
     matches = [*request_matches(scope, EVENT, COMMITTED), name]
     newest = next(JournalReader().newest(matches, 1), {})
@@ -153,6 +154,10 @@ def _refuse_released(scope: Scope, asked: Asked) -> None:
 
 
 def _asked(scope: Scope, matches: list[str]) -> Iterator[Asked]:
+    # Imported late: only a start by name, of what has ended, reads the journal.
+    from dora_systemd.adapters.journal.reader import JournalReader
+    from dora_systemd.decisions.logs.query import request_matches
+
     every, forgotten = [*request_matches(scope, EVENT, FORGOTTEN), *matches], set[object]()
     for record in JournalReader().newest(every, None, is_whole=True):
         if record.get("DORA_EVENT") == FORGOTTEN:

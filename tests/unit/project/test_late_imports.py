@@ -33,6 +33,9 @@ LATE = {
     "it has all properties, and verbs that read processes judge no systemd": {
         "decisions.views.diagnosis": {"decisions.unit.systemd_versions"},
     },
+    "only a start by name, of what has ended, reads the journal": {
+        "verbs.start.restart_ended": {"adapters.journal.reader", "decisions.logs.query"},
+    },
     "only some verbs wrap, and only on a terminal": {
         "terminal_text": {"textwrap"},
     },
