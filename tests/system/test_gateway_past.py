@@ -111,7 +111,6 @@ def look(browser: Browser, name: str) -> None:
     browser.picture(name, is_whole=True)
 
 
-@pytest.mark.warns(*KILLED)
 def test_what_a_node_forges_is_bounded_text(
     browser: Browser, cell: Cell, project: Project, front: Front
 ) -> None:
@@ -149,6 +148,7 @@ def test_times_are_local_with_utc_beside_them(browser: Browser) -> None:
     assert ("(" in text, zone, field) == (False, "times in UTC", "2026-11-27T08:20:15")
 
 
+@pytest.mark.warns(*KILLED)
 @pytest.mark.usefixtures("shaky")
 def test_the_timeline_without_a_pointer(browser: Browser) -> None:
     browser.wait_js(f"{THINGS}.some((one) => one.includes('crashed'))")
