@@ -68,6 +68,11 @@ def all_verbs() -> dict[str, click.Command]:
     return found
 
 
+def test_the_first_page_is_short() -> None:
+    """What somebody reads first: the other pages have the rest."""
+    assert len((MAN / "dora-systemd.7").read_text().splitlines()) <= 500
+
+
 def test_every_verb_has_an_entry() -> None:
     headings = list(sections("doractl.1"))
     first, last = headings.index("VERBS") + 1, headings.index("ENVIRONMENT")
