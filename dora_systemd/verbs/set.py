@@ -19,7 +19,12 @@ from dora_systemd.decisions.cell import line_rates
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, check_nodes, node_limits
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
-from dora_systemd.decisions.settings.limit_checks import check_cpus, check_use, size_warnings
+from dora_systemd.decisions.settings.limit_checks import (
+    check_cpus,
+    check_kept,
+    check_use,
+    size_warnings,
+)
 from dora_systemd.decisions.settings.limits import LOG_RATE_LIMIT
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings, runner_texts
 from dora_systemd.decisions.settings.table import CHANGEABLE
@@ -66,9 +71,12 @@ def set_limits(
     unit = manager.read(cell.unit, _PROPERTIES)
     values = {key: settings.values[key] for key in BY_KEY}
     warnings = (*size_warnings(values, nodes, read_machine()), *_placed_warnings(cell, rates))
-    if unit["ControlGroup"] and not is_forced:
+    if unit["ControlGroup"]:
         group = cgroup.group_path(unit["ControlGroup"])
-        check_use(values, nodes, cgroup.read_usage(group).memory, _held(group))
+        kept = cgroup.read_numbers(group / "memory.stat").get("shmem", 0)
+        if not is_forced:
+            check_use(values, nodes, cgroup.read_usage(group).memory, _held(group))
+        check_kept(values["memory_limit"], kept)
     # systemd stores drop-ins of a transient unit in /run in any case.
     is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
     # The kernel is the most likely to refuse, then systemd. `undo` reverts the steps before that.

@@ -27,7 +27,7 @@ for event in node:
 ALONE = "nodes: [{id: sink, path: sink.py, inputs: {t: dora/timer/millis/100}}]"
 KILLED_FOR_MEMORY = (
     r"the (supervisor process was killed, out of memory|dora \w+ is gone \(out of memory, )"
-    r"|node sink: out of memory, peak \S+, limit of the dataflow 5M"
+    r"|node sink: out of memory, peak \S+, limit of the dataflow \S+"
 )
 """The kernel chooses what it kills first, and what lives long enough to record that."""
 CHILD = """
@@ -222,7 +222,12 @@ def test_a_limit_that_kills_the_supervisor_process_is_named(cell: Cell, project:
     words = r"cannot limit the memory of the dataflow to 5M: it uses \S+ now"
     assert re.search(words, done.stderr), done.stderr
     assert (done.returncode, control(cell, ".", "memory.max")) == (1, str(300 << 20))
-    cell.doractl("set", cell.name, "--memory-limit=5M", "--force", check=False)
+    # systemd starts ExecStopPost= there: it hung in one of 60 rounds where files filled the limit.
+    done = cell.doractl("set", cell.name, "--memory-limit=5M", "--force", check=False)
+    least = re.search(r"hint: (\S+) or more; systemd would hang in less", done.stderr)
+    assert least, done.stderr
+    assert (done.returncode, control(cell, ".", "memory.max")) == (1, str(300 << 20))
+    cell.doractl("set", cell.name, f"--memory-limit={least[1]}", "--force")
     wait_for("it has failed", lambda: cell.show("ActiveState") == "failed", 120)
     wait_for("the journal has it", lambda: why(cell)["cause"] != "no-end")
     found = why(cell)

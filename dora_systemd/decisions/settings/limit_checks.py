@@ -26,6 +26,9 @@ _CONTROLLERS = {
 """Keys of a unit that need a controller, see systemd.resource-control(5)."""
 
 _MEMORY = "memory_limit"
+_MEGABYTE = 1024 * 1024
+_STOP_POST_BYTES = 12 * _MEGABYTE
+"""What ExecStopPost= of a dataflow takes."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +126,23 @@ def check_use(
                 f"it uses {_shown(_MEMORY, used)} now",
                 "--force does it; the kernel may kill processes then",
             )
+
+
+def check_kept(limit: int | None, kept: int) -> None:
+    """Raise DoraSystemdError for a memory limit of the dataflow that systemd would hang in.
+
+    kept: bytes of files in memory, such as those in /dev/shm, which stay when all processes have
+    ended. systemd starts ExecStopPost= in the same group. Where that group is above its limit and
+    has nothing that the kernel may kill, systemd waits for that start until the machine is reset
+    (systemd issue 40208).
+    """
+    least = -(-(kept + _STOP_POST_BYTES) // _MEGABYTE) * _MEGABYTE
+    if limit is not None and kept and limit < least:
+        raise DoraSystemdError(
+            f"cannot limit the memory of the dataflow to {_shown(_MEMORY, limit)}: "
+            f"{_shown(_MEMORY, kept)} are files in memory, which stay when its processes end",
+            f"{_shown(_MEMORY, least)} or more; systemd would hang in less",
+        )
 
 
 def _above(

@@ -151,6 +151,18 @@ def test_a_limit_below_what_the_dataflow_uses(place: Place) -> None:
     assert (caught.value.message, place.manager.calls) == (told, [])
 
 
+def test_no_force_for_a_limit_that_systemd_would_hang_in(place: Place) -> None:
+    (place.root / "cgroup/unit/memory.stat").write_text(f"anon {40 << 20}\nshmem {8 << 20}\n")
+    flags = {"memory_limit": "19M"}
+    with pytest.raises(DoraSystemdError) as caught:
+        set_limits(place.manager, place.scope, place.cell, flags, is_forced=True)
+    assert "to 19M: 8M are files in memory, which stay when" in caught.value.message
+    assert caught.value.hint.startswith("20M or more")
+    assert place.manager.calls == []
+    set_limits(place.manager, place.scope, place.cell, {"memory_limit": "20M"}, is_forced=True)
+    assert place.manager.calls
+
+
 @pytest.mark.parametrize(
     ("flags", "code", "words"),
     [
