@@ -13,7 +13,7 @@ from tests.system.gateways import Front
 from tests.system.releases import ETC, Releases
 
 REBOOT = "reboot"
-SECONDS = int(os.environ.get("SECONDS", "0"))
+SECONDS = int(os.environ.get("SAVE_SECONDS", "0"))
 """What the recorder needs to complete its file; 0 for twice the grace duration."""
 HEADER = ("KIND", "COUNT", "LOST", "OVERTAKEN")
 
