@@ -23,10 +23,9 @@ def one_node(project: Project) -> Path:
     return project.write("dataflow.yml", TIMER)
 
 
-def refusal(cell: Cell, project: Project, *needs: str) -> str:
-    """The error of a start with these needs, which has changed nothing."""
-    flags = [word for need in needs for word in ("--needs", need)]
-    done = cell.start(one_node(project), *flags, check=False)
+def refusal(cell: Cell, project: Project, need: str, flag: str = "--needs") -> str:
+    """The error of a start with this need, which has changed nothing."""
+    done = cell.start(one_node(project), flag, need, check=False)
     assert done.returncode != 0
     assert cell.show("LoadState") == "not-found"
     lines = [line for line in done.stderr.splitlines() if "cannot" in line]
@@ -83,7 +82,7 @@ def test_bad_needs_are_refused_before_anything_starts(cell: Cell, project: Proje
     assert "wait for each other" in refusal(cell, project, f"dataflow:{cell.name}")
     assert "unit no-such.service is not-found" in refusal(cell, project, "unit:no-such.service")
     assert "nothing is mounted" in refusal(cell, project, "mount:/mnt/nowhere")
-    assert "no such node" in refusal(cell, project, "camera=/dev/video0")
+    assert "no such node" in refusal(cell, project, "camera:needs=/dev/video0", "--node")
     assert "a path is what a node needs" in refusal(cell, project, "/dev/video0")
 
 
