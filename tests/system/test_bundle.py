@@ -309,8 +309,10 @@ def test_a_failure_has_its_recording(
     wait_for("it sends again", lambda: len(cell.messages("talker")) > last + 20)
     cell.doractl("stop", cell.name)
     assert cell.show("LoadState") == "not-found"
+    cell.start(flow)
+    Ring.uuid = cell.status.uuid
+    wait_for("it records again", partial(has_more, 30))
     project.write("fail", "")
-    cell.start(flow, check=False)
     wait_for("it has failed again", lambda: cell.show("ActiveState") == "failed", seconds=60)
     assert int(cell.show("NFileDescriptorStore")) > 0
     cell.doractl("reset", cell.name)
