@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, wait_no_process
+from tests.system.cells import Cell, Project, run, wait_no_process
 from tests.system.chromium import Browser
 from tests.system.complaints import complaints, end_of_journal
 from tests.system.gateways import Front
@@ -76,6 +76,14 @@ def releases(cell: Cell) -> Iterator[Releases]:
     releases = Releases(cell)
     yield releases
     releases.end()
+
+
+@pytest.fixture(scope="module")
+def units_for_all() -> Iterator[None]:
+    """The units of `doractl setup`, which notices and bundles after failures need."""
+    run("doractl", "setup")
+    yield
+    run("doractl", "setup", "--remove", check=False)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -16,7 +16,7 @@ from tests.system.cells import Cell, Project, journalctl, run, sync_journal, wai
 from tests.system.test_bundle import STORE
 
 # The units of notices are installed below /usr/local.
-pytestmark = pytest.mark.lab
+pytestmark = [pytest.mark.lab, pytest.mark.usefixtures("units_for_all")]
 
 KILLED = (
     *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was killed ("),
@@ -27,13 +27,6 @@ RESTARTS = (
     *("--restart-delay", "500ms", "--max-restart-delay", "500ms"),
 )
 ROUNDS, FAILURES = int(os.environ.get("ROUNDS", "2")), 5
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _units() -> Iterator[None]:
-    run("doractl", "setup")
-    yield
-    run("doractl", "setup", "--remove", check=False)
 
 
 @pytest.fixture

@@ -16,11 +16,12 @@ import pytest
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, journalctl, run, sync_journal, wait_for
-from tests.system.test_record import Ring, has_more
+from tests.system.test_record import has_more
+from tests.system.test_record import start as start_recorded
 from tests.unit.fakes.recorder.mcap import File
 
 # The units of notices are installed below /usr/local.
-pytestmark = pytest.mark.lab
+pytestmark = [pytest.mark.lab, pytest.mark.usefixtures("units_for_all")]
 
 STORE = Path("/var/lib/dora-systemd/bundles")
 NODE = """
@@ -103,14 +104,6 @@ def texts(path: Path) -> dict[str, bytes]:
 def written(cell: Cell, *more: str) -> Path:
     sync_journal()
     return Path(cell.doractl("bundle", cell.name, *more).stdout.strip())
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _units() -> Iterator[None]:
-    """The setting on_failure, in which a secret is planted, needs them."""
-    run("doractl", "setup")
-    yield
-    run("doractl", "setup", "--remove", check=False)
 
 
 @pytest.mark.warns(*CRASHES, "exited with", "failed: ", "talker")
@@ -287,8 +280,7 @@ def test_a_failure_has_its_recording(
     flow = project.write("dataflow.yml", f"nodes: [{node}]\n")
     settings = f"black_box: yes\nrecord: yes\nrestart_policy: {policy}\n"
     project.write("dataflow.systemd.yml", settings)
-    cell.start(flow, "--max-restarts", "1") if policy != "no" else cell.start(flow)
-    Ring.uuid, Ring.uid = cell.status.uuid, cell.paths.root.stat().st_uid
+    start_recorded(cell, flow, *(() if policy == "no" else ("--max-restarts", "1")))
     wait_for("it records", partial(has_more, 30))
     project.write("fail", "")
     wait_for("it has failed", lambda: cell.show("ActiveState") == "failed", seconds=60)
@@ -309,8 +301,7 @@ def test_a_failure_has_its_recording(
     wait_for("it sends again", lambda: len(cell.messages("talker")) > last + 20)
     cell.doractl("stop", cell.name)
     assert cell.show("LoadState") == "not-found"
-    cell.start(flow)
-    Ring.uuid = cell.status.uuid
+    start_recorded(cell, flow)
     wait_for("it records again", partial(has_more, 30))
     project.write("fail", "")
     wait_for("it has failed again", lambda: cell.show("ActiveState") == "failed", seconds=60)

@@ -165,7 +165,7 @@ def test_the_timeline_without_a_pointer(browser: Browser) -> None:
     browser.press("Enter", "\r")
     browser.wait_js("document.querySelector('#log-time').value === 'range'")
     browser.wait_text(".logs .found", "found")
-    # The axis moves on, and who is on it stays there.
+    # The axis moves on, and the focus stays on the same mark.
     browser.js("document.querySelector('.past .thing[data-tone=bad]').focus(), 0")
     held = browser.js("document.activeElement.dataset.key")
     browser.resize(1000, 900)

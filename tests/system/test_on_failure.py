@@ -5,7 +5,6 @@ import os
 import pwd
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from tests.system.cells import Cell, Project, journalctl, run, wait_for
 from tests.system.releases import Releases, write_version
 
 # The units of notices are installed below /usr/local.
-pytestmark = pytest.mark.lab
+pytestmark = [pytest.mark.lab, pytest.mark.usefixtures("units_for_all")]
 
 SOURCE = """
 import os, sys
@@ -49,13 +48,6 @@ cat
 mv "$OUT/$$.new" "$OUT/$$.notice"
 """
 FAILS = ("after failure", "node exited with error", "source", "failed: ", "Failed with")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _units() -> Iterator[None]:
-    run("doractl", "setup")
-    yield
-    run("doractl", "setup", "--remove", check=False)
 
 
 def flow(project: Project, tell: str = TELL) -> Path:

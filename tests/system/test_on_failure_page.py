@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import Cell, Project, wait_for
 from tests.system.test_on_failure import FAILS, FLOW, SINK, SOURCE
 from tests.system.typed import Shell, by_kind, replay
 
 # The units of notices are installed below /usr/local.
-pytestmark = pytest.mark.lab
+pytestmark = [pytest.mark.lab, pytest.mark.usefixtures("units_for_all")]
 
 PAGE = Path(__file__).parents[2] / "docs/on-failure.md"
 SCRIPTS = {
@@ -83,13 +83,6 @@ class MailHandler(socketserver.StreamRequestHandler):
         """The lines of a mail."""
         while (line := self.rfile.readline()) not in (b".\r\n", b""):
             yield line.decode()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _units() -> Iterator[None]:
-    run("doractl", "setup")
-    yield
-    run("doractl", "setup", "--remove", check=False)
 
 
 @pytest.fixture
