@@ -80,7 +80,10 @@ def read_own_bundles(scope: Scope, uuid: str) -> dict[str, Any]:
 
 
 def read_waits(scope: Scope, uuid: str) -> dict[str, Any]:
-    """The nodes of a dataflow that wait for a CPU, and who has it. Raises DoraSystemdError."""
+    """The nodes of a dataflow that wait for a CPU, and the processes that use that CPU.
+
+    Raises DoraSystemdError.
+    """
     bus = Bus(scope, for_reading=True)
     cell = Selector(uuid).find(bus)
     waits = read_cpu_waits(read_dataflow(bus, scope, cell)) if cell.is_up else ()

@@ -1,15 +1,16 @@
-// What the processes of a dataflow had to wait for, and who had the CPU meanwhile.
+// What the processes of a dataflow had to wait for, and which processes used the CPU meanwhile.
 
 import { el, say } from "./dom.js";
 import { waitWords } from "./history.js";
 
-// Percent from which on the gateway is asked who has the CPU: as `doractl why` shows.
+// Percent of waiting from which the page requests the processes that use the CPU. `doractl why` has
+// the same limit.
 const LONG = 20;
 const EVERY_MS = 30000;
 const MEANING = "This is the share of the last seconds in which a process was ready to continue, but had to wait.";
 
 export class Waits {
-  /** ask: requests of the gateway who has the CPU. */
+  /** ask: requests the processes that use the CPU from the gateway. */
   constructor(ask) {
     this.ask = ask;
     this.askedAt = -EVERY_MS;

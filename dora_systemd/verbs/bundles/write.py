@@ -101,8 +101,7 @@ def write_bundle(
         store = BundleStore(scope.state_root, subject.name)
         with locked(store), _explained(store.path):
             store.remove_partial()
-            path = store.new_path(time.strftime(STAMP, time.gmtime()), REQUESTED)
-            written = _write(path, min(MOST_BYTES, room(store.path)), what, manifest)
+            written = _store(store, REQUESTED, MOST_BYTES, what, manifest)
     details = {"scope": scope.word, "file": str(written.path)}
     note_request(BUNDLE_WRITTEN, subject.name, subject.uuid, command, **details)
     return written
@@ -182,9 +181,15 @@ def _written_after(
             message = f"one about {about} was written less than 10 minutes ago"
             raise DoraSystemdError(message, "doractl bundle writes one now")
         store.drop(to_remove(past, box.keep))
-        most = min(box.most, room(store.path))
-        path = store.new_path(time.strftime(STAMP, time.gmtime()), failure.event)
-        return str(_write(path, most, what, manifest).path)
+        return str(_store(store, failure.event, box.most, what, manifest).path)
+
+
+def _store(
+    store: BundleStore, event: str, most: int, what: Evidence, manifest: Manifest
+) -> Written:
+    """Write a bundle of at most `most` bytes to the store; call it with the lock."""
+    path = store.new_path(time.strftime(STAMP, time.gmtime()), event)
+    return _write(path, min(most, room(store.path)), what, manifest)
 
 
 def _past(one: Stored) -> Past:
