@@ -300,14 +300,14 @@ def test_a_failure_has_its_recording(
     assert cell.show("NRestarts") == "0"
     wait_for("it sends again", lambda: len(cell.messages("talker")) > last + 20)
     cell.doractl("stop", cell.name)
-    assert cell.show("LoadState") == "not-found"
+    wait_for("systemd unloads it", lambda: cell.show("LoadState") == "not-found")
     start_recorded(cell, flow)
     wait_for("it records again", partial(has_more, 30))
     project.write("fail", "")
     wait_for("it has failed again", lambda: cell.show("ActiveState") == "failed", seconds=60)
     assert int(cell.show("NFileDescriptorStore")) > 0
     cell.doractl("reset", cell.name)
-    assert cell.show("LoadState") == "not-found"
+    wait_for("systemd unloads it", lambda: cell.show("LoadState") == "not-found")
 
 
 def test_a_full_disk(cell: Cell, project: Project) -> None:
