@@ -120,6 +120,11 @@ def read_usage(path: Path) -> Usage:
 
     Without a memory controller, memory is the sum of the processes' resident sets.
     """
+    return read_present(path)._replace(memory_peak=read_number(f"{path}/memory.peak"))
+
+
+def read_present(path: Path) -> Usage:
+    """Read what read_usage() does, but the peak, which many readers do not need."""
     # Texts for paths, here and below: a Path takes longer than the kernel does for a file.
     memory = read_number(f"{path}/memory.current")
     if memory is None:
@@ -127,7 +132,6 @@ def read_usage(path: Path) -> Usage:
         memory = sum(map(_resident_bytes, some))
     return read_cpu(path)._replace(
         memory=memory,
-        memory_peak=read_number(f"{path}/memory.peak"),
         memory_max=read_number(f"{path}/memory.max"),
         cpu_max=_read_share(f"{path}/cpu.max"),
     )

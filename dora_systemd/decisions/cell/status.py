@@ -258,6 +258,8 @@ def _object(raw: Any, what: str) -> dict[str, Any]:
 
 def _by_node(raw: Any, parse: Callable[[Any], Value]) -> dict[str, Value]:
     given = _object(raw, "what is kept by node")
+    if not given:
+        return {}
     if len(given) > MAX_NODES + 1:
         raise _Wrong(f"it has more than {MAX_NODES} nodes")
     if any(key != WHOLE_CELL and not is_node_id(key) for key in given):

@@ -1,6 +1,7 @@
 """The table of `doractl list`, from facts of systemd and the runner."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 from dora_systemd.decisions.needs.waiting import format_wait
 from dora_systemd.decisions.views.facts import SILENT, stopping_words
@@ -61,13 +62,20 @@ def status_word(active: str, sub: str, stage: str = "", is_held: bool = False) -
 
 def shortest_prefixes(uuids: Sequence[str]) -> dict[str, str]:
     """The shortest unique prefix of each UUID, at least SHORTEST_PREFIX characters."""
-    return {uuid: _prefix(uuid, [one for one in uuids if one != uuid]) for uuid in uuids}
+    ordered = sorted(set(uuids))
+    # No other UUID has more in common with one than its neighbours in the order.
+    shared = [0, *(_shared(one, other) for one, other in pairwise(ordered)), 0]
+    lengths = (max(two) + 1 for two in pairwise(shared))
+    return {
+        uuid: uuid[: max(length, SHORTEST_PREFIX)]
+        for uuid, length in zip(ordered, lengths, strict=False)  # without UUIDs there is a length
+    }
 
 
-def _prefix(uuid: str, others: Sequence[str]) -> str:
-    lengths = range(SHORTEST_PREFIX, len(uuid))
-    free = (n for n in lengths if not any(one.startswith(uuid[:n]) for one in others))
-    return uuid[: next(free, len(uuid))]
+def _shared(one: str, other: str) -> int:
+    """The number of characters that two texts begin with in common."""
+    pairs = enumerate(zip(one, other, strict=False))
+    return next((at for at, (left, right) in pairs if left != right), min(len(one), len(other)))
 
 
 _OPTIONAL = (
@@ -146,7 +154,8 @@ def _excess(columns: Sequence[Sequence[str]], width: int) -> int:
 
 def _aligned(column: Sequence[str], want_colors: bool) -> list[str]:
     adjust = str.rjust if column[0] in _RIGHT_ALIGNED else str.ljust
-    cells = [adjust(cell, _width(column)) for cell in column]
+    width = _width(column)
+    cells = [adjust(cell, width) for cell in column]
     if want_colors and column[0] in ("STATUS", "STATE"):
         return [colored_state(cell, cell.partition(" ")[0]) for cell in cells]
     return cells
@@ -197,6 +206,8 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> dict[str, str]:
 
 
 _WITH_WHY = (WAITING, DEGRADED)
+WITH_NODES = (*_WITH_WHY, STOPPING)
+"""The statuses of dataflows whose nodes the table names."""
 
 
 def _has_why(row: DataflowRow) -> bool:

@@ -17,6 +17,7 @@ from dora_systemd.decisions.resources.usage import (
     throttled_percent,
     usage_facts,
 )
+from dora_systemd.decisions.views.dataflows import WITH_NODES
 from dora_systemd.decisions.views.facts import OutputRow, node_row
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.scope import Scope
@@ -137,6 +138,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
     samples = known or (CpuSample(reading.unit[STARTED]),)
     groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
     names = status.nodes or dict.fromkeys(groups)
+    shown = names if not reading.is_row or reading.word in WITH_NODES else ()
     alive = status.alive_count if status.nodes else sum(map(cgroup.is_populated, groups.values()))
     return {
         **_numbers(use[WHOLE_CELL], samples, now, WHOLE_CELL),
@@ -157,7 +159,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                     "outputs": _outputs(reading, node),
                 },
             )
-            for node in names
+            for node in shown
         ),
     }
 

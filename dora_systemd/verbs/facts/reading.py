@@ -48,6 +48,7 @@ class Reading(NamedTuple):
     heard: tuple[int, ...] = ()
     held: "Held | None" = None  # what systemd waits for before it starts the dataflow
     is_frozen: bool = False  # whether the unit is frozen, see `systemctl freeze`
+    is_row: bool = False  # whether it has only what the table of `list` shows
 
     @property
     def word(self) -> str:
@@ -108,10 +109,11 @@ def read_dataflow(
     # can create groups too. With a table, the groups of its nodes are enough.
     nodes = {} if is_row and status.nodes else cgroup.shown_groups(path, status.nodes)
     groups = {WHOLE_CELL: path, **nodes}
-    usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
+    read_group = cgroup.read_present if is_row else cgroup.read_usage
+    usage = {key: read_group(group) for key, group in groups.items()}
     heard = () if is_row else _heard(scope, cell)
     read = Reading(cell, unit, status, problem, groups, usage, _monotonic_us(), heard)
-    return read._replace(is_frozen=cgroup.is_frozen(path))
+    return read._replace(is_frozen=cgroup.is_frozen(path), is_row=is_row)
 
 
 def _heard(scope: Scope, cell: Cell) -> tuple[int, ...]:

@@ -37,6 +37,7 @@ def test_usage_with_a_memory_controller(unit: Path) -> None:
     for name, text in (("current", "4096\n"), ("peak", "8192\n"), ("max", "max\n")):
         (unit / f"memory.{name}").write_text(text)
     assert cgroup.read_usage(unit) == Usage(1500, 4096, 8192, INFINITY, 1_500_000, (10, 3))
+    assert cgroup.read_present(unit) == cgroup.read_usage(unit)._replace(memory_peak=None)
 
 
 def test_usage_without_a_memory_controller(unit: Path) -> None:

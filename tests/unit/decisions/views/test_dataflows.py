@@ -1,6 +1,8 @@
 """Words and whole tables of `doractl list`."""
 
 import re
+from random import Random
+from uuid import UUID
 
 import pytest
 
@@ -62,6 +64,20 @@ def test_prefixes_are_short_and_unambiguous() -> None:
 
 def test_prefix_of_one() -> None:
     assert shortest_prefixes([A]) == {A: "550e8400"}
+
+
+def test_prefixes_of_many_mean_one_each() -> None:
+    dice = Random(7)
+    uuids = [str(UUID(int=dice.getrandbits(70) << 58)) for _ in range(300)]
+    uuids += [one[:-1] + "f" for one in uuids[:100]]
+    found = shortest_prefixes(uuids)
+    assert found.keys() == set(uuids)
+    for uuid, prefix in found.items():
+        assert [one for one in found if one.startswith(prefix)] == [uuid]
+        longer = len(prefix) > 8
+        assert not longer or sum(one.startswith(prefix[:-1]) for one in found) > 1
+    assert shortest_prefixes([A, A]) == {A: "550e8400"}
+    assert shortest_prefixes([]) == {}
 
 
 ROWS = (
