@@ -97,6 +97,7 @@ class Sight:
 class LentSight(Sight):
     """The file system as another account sees it.
 
+    Each request is sent once, so all that is decided by an answer is decided by the same one.
     Raises DoraSystemdError if its child is silent.
     """
 
@@ -106,13 +107,23 @@ class LentSight(Sight):
         self._child = child
         self._account = account
         self._left = seconds
+        self._known: dict[tuple[bytes, str], bytes | int] = {}
 
     def _ask(self, letter: bytes, path: str) -> bytes:
-        """Send one request to the child. Raises the OSError that the account got."""
+        """Answer one request. Raises the OSError that the account got."""
+        if (letter, path) not in self._known:
+            self._known[letter, path] = self._send(letter, path)
+        answer = self._known[letter, path]
+        if isinstance(answer, int):
+            raise OSError(answer, os.strerror(answer))
+        return answer
+
+    def _send(self, letter: bytes, path: str) -> bytes | int:
+        """Send one request to the child; return its answer, or the number of an error."""
         assert self._child.stdin and self._child.stdout
         question = os.fsencode(path)
         if len(question) > _LONGEST:
-            raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+            return errno.ENAMETOOLONG
         begun = time.monotonic()
         deadline = begun + self._left
         try:
@@ -127,8 +138,7 @@ class LentSight(Sight):
             self._left -= time.monotonic() - begun
         if head[:1] != b"+":
             is_number = data.isdigit() and len(data) <= _MOST_DIGITS
-            number = int(data) if is_number else errno.EINVAL
-            raise OSError(number, os.strerror(number))
+            return int(data) if is_number else errno.EINVAL
         return data
 
 

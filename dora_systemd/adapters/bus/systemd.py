@@ -71,6 +71,7 @@ class Bus:
         self.scope = scope
         self._bus = connect(scope, for_reading, seconds)
         self._matches: dict[bytes, Callable[..., None]] = {}
+        self._version = ""
 
     def __del__(self) -> None:
         # pystemd closes its two file descriptors only on request; the gateway opens many.
@@ -182,7 +183,8 @@ class Bus:
         self._call(f"disable {units[0]}", "DisableUnitFiles", ("as", units), ("b", False))
 
     def version(self) -> str:
-        return str(self._get("read systemd's version", "Version"))
+        self._version = self._version or str(self._get("read systemd's version", "Version"))
+        return self._version
 
     def property_types(self) -> dict[str, str]:
         # All services have the same properties, and systemd answers for an unknown unit as well.

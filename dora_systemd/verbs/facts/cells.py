@@ -136,10 +136,14 @@ def proven(cells: Iterable[Cell]) -> list[Cell]:
 
 def read_cell(manager: Manager, unit: str) -> Cell | None:
     """The dataflow of one unit, or None if it does not exist or is not ours."""
-    state = manager.read(unit, ["LoadState", "ActiveState", "SubState"])
-    if state["LoadState"] != "loaded":
-        return None
-    found = UnitState(unit, state["LoadState"], state["ActiveState"], state["SubState"])
+    load = str(manager.read(unit, ["LoadState"])["LoadState"])
+    return loaded_cell(manager, unit) if load == "loaded" else None
+
+
+def loaded_cell(manager: Manager, unit: str) -> Cell | None:
+    """The dataflow of a unit that systemd has loaded, or None if it is not ours."""
+    state = manager.read(unit, ["ActiveState", "SubState"])
+    found = UnitState(unit, "loaded", state["ActiveState"], state["SubState"])
     if found.active in DOWN:
         # Only the list has the types of jobs. It may have lost the unit, which it does not load.
         found = next(iter(manager.list_units(unit)), found)

@@ -20,7 +20,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import shown
-from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.facts.cells import Cell, loaded_cell
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import (
     BootUnit,
@@ -103,10 +103,11 @@ def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
     Returns the unit file, if there is one. Raises DoraSystemdError (NAME_IN_USE), which names what
     is running.
     """
-    cell = read_cell(manager, unit)
+    load = manager.read(unit, ["LoadState"])["LoadState"]
+    cell = loaded_cell(manager, unit) if load == "loaded" else None
     if cell is not None and cell.is_up:
         raise _in_use(manager, cell)
-    if cell is None and manager.read(unit, ["LoadState"])["LoadState"] != "not-found":
+    if cell is None and load != "not-found":
         raise DoraSystemdError(
             f"cannot start {unit}: a unit of that name already exists",
             f"see systemctl {scope.flag} cat {unit}; choose another --name",
@@ -120,10 +121,11 @@ def make_room(manager: Manager, boot: BootUnit) -> None:
 
     So only after everything that can refuse a start. Raises DoraSystemdError (NAME_IN_USE).
     """
-    state = manager.read(boot.unit, ["LoadState", "Transient"])
-    if state["Transient"]:
+    if manager.read(boot.unit, ["Transient"])["Transient"]:
         _forget(manager, boot)
-    elif boot.text is not None and state["LoadState"] == "not-found":
+    elif boot.text is None:
+        return
+    elif manager.read(boot.unit, ["LoadState"])["LoadState"] == "not-found":
         manager.reload()  # see lost_units()
 
 
@@ -173,11 +175,8 @@ def place_unit_file(
     want_boot: write the file in any case. Raises DoraSystemdError (NAME_IN_USE) if the dataflow is
     enabled with other settings.
     """
-    scope = plan.scope
-    target = boot_target(manager, scope)
-    text = persistent_unit(
-        [format_unit(properties)], plan.options, scope.is_user, target, boot.is_checked
-    )
+    has_file = want_boot or boot.text is not None
+    text = _boot_text(manager, plan, properties, boot) if has_file else ""
     is_kept = boot.text is not None and boot.is_enabled and not want_boot
     links = _link_files(plan, systemd_number(manager)) if plan.members else {}
     is_same = says_the_same(text, boot.text or "") and all(
@@ -203,6 +202,13 @@ def place_unit_file(
     elif not is_kept:
         drop_unit_files(manager, boot)
     return want_boot or is_kept
+
+
+def _boot_text(manager: Manager, plan: Plan, properties: Properties, boot: BootUnit) -> str:
+    """The unit file with which a boot would start the plan."""
+    scope = plan.scope
+    target, texts = boot_target(manager, scope), [format_unit(properties)]
+    return persistent_unit(texts, plan.options, scope.is_user, target, boot.is_checked)
 
 
 def _link_files(plan: Plan, systemd: int) -> dict[str, str]:

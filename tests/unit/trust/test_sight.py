@@ -32,8 +32,19 @@ def test_answers_to_questions_that_nobody_reads() -> None:
         sight = LentSight(child, own_account(), 2.0)
         assert sight.exists("/nowhere")
         with pytest.raises(DoraSystemdError, match="no answer"):
-            for _ in range(64):
-                sight.exists(LONG)
+            for number in range(64):
+                sight.exists(f"{LONG}{number}")
+        child.kill()
+
+
+@pytest.mark.parametrize("said", ["+00000011", "-00000012"])
+def test_an_answer_is_kept(said: str) -> None:
+    """What is decided by an answer is decided by the same one; the child sends it once."""
+    with subprocess.Popen(["sh", "-c", f"printf %s {said}; cat >&2"], stdin=-1, stdout=-1) as child:
+        sight = LentSight(child, own_account(), 2.0)
+        assert [sight.exists("/x") for _ in range(3)] == [said[0] == "+"] * 3
+        with pytest.raises(DoraSystemdError, match="no answer"):
+            LentSight(child, own_account(), 0.05).exists("/x")
         child.kill()
 
 

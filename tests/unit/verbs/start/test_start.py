@@ -49,7 +49,9 @@ def unit_file(manager: FakeManager) -> Path:
 def test_a_free_name(manager: FakeManager, scope: Scope) -> None:
     boot = require_free_name(manager, scope, UNIT)
     assert (boot.path, boot.text, boot.is_enabled) == (unit_file(manager), None, False)
+    manager.questions = 0
     assert not place(manager, make_plan(scope))
+    assert manager.questions == 3, "LoadState, UnitPath and Transient, each once"
     assert manager.calls == []
 
 
