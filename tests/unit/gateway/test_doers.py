@@ -39,7 +39,9 @@ class Bench:
 
     def __init__(self, root: Path, patch: pytest.MonkeyPatch, active: str = "active") -> None:
         self.manager = FakeManager()
-        self.manager.add(options(dataflow=str(root / "flow.yml")), active=active)
+        self.units = root / "units"  # in the place of systemd's own, which only root may change
+        runner = options(dataflow=str(root / "flow.yml"))
+        self.manager.add(runner, active=active, FragmentPath=str(self.units / UNIT))
         self.systemd: FakeSystemd = fake_systemd(patch, self.manager)
         self.scope: Scope = ScopeIn(is_user=True, uid=os.getuid(), root=root)
         self.notes: list[bytes] = []
@@ -181,6 +183,7 @@ def test_what_the_verbs_refuse_the_page_refuses(
         bench.act(action, **values)
     # systemd reloads, but nothing has changed then.
     assert set(bench.manager.calls) <= {("reload",)}
+    assert not [*bench.units.rglob("*.conf")]
 
 
 def test_the_page_sets_limits(
@@ -188,7 +191,6 @@ def test_the_page_sets_limits(
 ) -> None:
     mount = fake_cgroups(monkeypatch, tmp_path)
     (mount / "cgroup.controllers").write_text("memory")
-    bench.manager.units[UNIT]["FragmentPath"] = str(tmp_path / UNIT)
     with fake_runner(bench.scope.cell_directory("robot")) as asked:
         done = bench.change("set", memory_limit="6G", hot_reload="off")
     assert done == f"Limits changed: {UUID} (robot); Hot reload off: {UUID} (robot)"
