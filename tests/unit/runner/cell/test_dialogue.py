@@ -3,7 +3,7 @@
 import asyncio
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -12,13 +12,16 @@ import pytest
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.exits import Exit, exit_of
+from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import Do, State
+from dora_systemd.decisions.recorder.record import RECORDER
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.errors import DoraSystemdError
-from tests.unit.fakes.dialogue import DESCRIPTOR, Bench
+from tests.unit.fakes.dialogue import DESCRIPTOR, OPTIONS, Bench
 from tests.unit.fakes.loop import ImpatientLoop, live, settle
+from tests.unit.fakes.manager import with_texts
 
 ENDED = {"DataflowStopped": {"result": {"node_results": {"a": {"Ok": None}}}}}
 
@@ -105,6 +108,27 @@ def test_the_result_is_asked_for_until_it_is_there(tmp_path: Path) -> None:
             [{"DataflowSpawned": {}}, {"DataflowSpawned": {}}, ENDED]
         )
         assert await bench.do(Do.ASK_RESULT) == [life.ResultKnown(0, {"a": Exit()})]
+
+    live(work)
+
+
+@pytest.mark.parametrize("texts", [("record=last=10s",), ()], ids=["recorded", "called so"])
+def test_the_recorder_is_none_of_the_dataflow(tmp_path: Path, texts: Sequence[str]) -> None:
+    results = {"a": {"Ok": None}, RECORDER: {"Ok": None}}
+    ended = {"DataflowStopped": {"result": {"node_results": results}}}
+
+    async def work() -> None:
+        bench = Bench(tmp_path, State.CLOSING, options=with_texts(OPTIONS, *texts))
+        bench.dora.answers["Check"].append(ended)
+        (event,) = await bench.do(Do.ASK_RESULT)
+        assert isinstance(event, life.ResultKnown)
+        assert event.results.keys() == ({"a"} if texts else {"a", RECORDER})
+        await bench.do(Do.SUBSCRIBE)
+        bench.calls.clear()
+        assert bench.dora.hear is not None
+        bench.dora.hear(LogRecord("INFO", "daemon", RECORDER, "spawned node with pid 8"))
+        adopted = [("adopt", RECORDER, 8), ("push", "NodeSpawned")]
+        assert bench.calls == ([] if texts else adopted)
 
     live(work)
 
