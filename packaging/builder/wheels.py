@@ -16,7 +16,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from lab import definition
-from lab.cache import find_cache
+from lab.cache import Layer, ensure, find_cache
 from lab.errors import LabError, Stage, say
 from lab.foreign import emulated, ensure_foreign_room
 from lab.options import FOREIGN
@@ -58,13 +58,37 @@ def build_wheels(cache: Path, place: Path, target: str) -> Path:
     if is_other:
         shutil.copytree(target, build / "python", symlinks=True)
     program = "python/bin/python3" if is_other else "python3"
-    command = [program, "-m", "pip", "wheel", "--no-deps", "--no-cache-dir", "--wheel-dir=wheels"]
-    network = network_environment(build)
     emulator = emulated() if target == FOREIGN else nullcontext()
     with emulator, Stage(f"wheels for the Python of {target}"):
-        words = [*command, "./dora-systemd", *COMPILED]
-        run_in_room(room, build, words, network, has_network=True)
-    return build / "wheels"
+        run_pip(room, build, program, ["./dora-systemd"])
+        if is_other:
+            run_pip(room, build, program, [*COMPILED])
+        else:
+            shutil.copytree(
+                ensure_compiled(cache, room, build), build / OUT.name, dirs_exist_ok=True
+            )
+    return build / OUT.name
+
+
+def run_pip(room: Path, build: Path, program: str, what: Sequence[str]) -> None:
+    """Build wheels in `room`."""
+    command = [program, "-m", "pip", "wheel", "--no-deps", "--no-cache-dir"]
+    command += [f"--wheel-dir={OUT.name}", *what]
+    run_in_room(room, build, command, network_environment(build), has_network=True)
+
+
+def ensure_compiled(cache: Path, room: Path, build: Path) -> Path:
+    """The wheels of the libraries, which are compiled once in a room: they change with it."""
+
+    def compile_them(path: Path) -> None:
+        own = {*(build / OUT.name).iterdir()}
+        run_pip(room, build, "python3", [*COMPILED])
+        for wheel in {*(build / OUT.name).iterdir()} - own:
+            shutil.copy(wheel, path)
+
+    kind = room.name.partition("-")[0].replace("wheelroom", "compiled")
+    key = definition.digest(room.name, sorted(COMPILED), definition.read_part(Path(__file__)))
+    return ensure(cache, Layer(kind, key, compile_them))
 
 
 def ensure_wheel_room(cache: Path, suite: str) -> Path:

@@ -65,6 +65,8 @@ def build_previous(place: Path, edits: Mapping[str, tuple[str, str]] = {}) -> li
 
 def install(paths: Sequence[Path] = ()) -> None:
     """Install these packages, or those of this build, as a user does; there or not there."""
+    if not AUTOPKGTEST:  # Debian's index of manuals takes longer than the rest
+        Path("/var/lib/man-db/auto-update").unlink(missing_ok=True)
     options = ("--yes", "--reinstall", "--allow-downgrades", "-o", "Dpkg::Use-Pty=0")
     apt("install", *options, *map(str, paths or find_packages()))
 

@@ -7,12 +7,15 @@ So systemd-nspawn finds a plain v2 host, and the host's own mounts are neither u
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from lab.errors import LabError
 
 ROOT = Path("/sys/fs/cgroup")
 MARK = "LAB_NAMESPACE"
+USAGE = "LAB_USAGE"
+"""The variable with the file for the processor time of containers: their processes are not ours."""
 
 
 def enter_namespace() -> None:
@@ -56,3 +59,12 @@ def enter_command(name: str) -> tuple[list[str], Path]:
 
 def join_command(path: Path) -> list[str]:
     return ["sh", "-c", f'echo $$ > {path}/cgroup.procs && exec "$@"', "sh"]
+
+
+def note_usage(path: Path) -> None:
+    """Add what all in a cgroup have used to the file of LAB_USAGE, if there is one."""
+    file = os.environ.get(USAGE)
+    if file:
+        with suppress(OSError), Path(file).open("a", encoding="ascii") as used:
+            stat = (path / "cpu.stat").read_text(encoding="ascii").split()
+            used.write(f"{int(stat[stat.index('usage_usec') + 1]) / 1e6:.2f}\n")

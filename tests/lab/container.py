@@ -85,6 +85,7 @@ def started_container(
             leader = wait_ready(ready, nspawn, run)
         yield Container(leader, path / "supervisor")
     finally:
+        cgroup.note_usage(path)
         remove_cgroup(path)
         nspawn.kill()
         nspawn.wait()

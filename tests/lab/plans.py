@@ -15,6 +15,7 @@ from lab.cache import find_cache
 from lab.changed import changed_rooms
 from lab.definition import CHECKOUT, NEW_SUITE, OLD_SUITE, PLATFORMS
 from lab.errors import LabError
+from lab.marked import marked_files
 from lab.options import FOREIGN, MACHINES
 from lab.process import need_root
 from lab.steps import Step, run_steps
@@ -76,10 +77,11 @@ def plan_test(form: str) -> list[Step]:
     restarted = replace(reboot_step(), after=(build.name, inside.name))
     arm = replace(openarm_step(), after=(restarted.name,))
     oldest, newest = platform_step(OLD_SUITE, minutes=2), platform_step(NEW_SUITE, "-k", NEW)
-    others = [*plan_lab(form), *plan_other_python(form), *plan_emulator(form)]
-    lane = [build, packages_step(), wheels_step(), oldest, newest, *others]
+    lane = [build, packages_step(), wheels_step(), oldest, newest, *plan_lab(form)]
+    others = [*plan_other_python(form), *plan_emulator(form)]
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
-    plan = [unit, *several, *in_a_row(lane, unit), inside, restarted, arm, *queue]
+    plan = [unit, *several, *in_a_row(lane, unit)]
+    plan += [inside, restarted, arm, *in_a_row(others, arm), *queue]
     return [replace(one, longest=max(LEAST_LONGEST, PATIENCE * one.minutes)) for one in plan]
 
 
@@ -145,14 +147,12 @@ def plan_vm(_form: str) -> list[Step]:
 
 
 def limits_step() -> Step:
-    arguments = ["tests/system", "-m", "vm"]
-    return lab_step("system tests that need limits, vm", "vm", arguments, minutes=5)
+    return lab_step("system tests that need limits, vm", "vm", marked("vm"), minutes=3)
 
 
 def plan_emulator(_form: str) -> list[Step]:
-    arguments = ["tests/system", "-m", "emulator"]
     name = "system tests that need Debian's kernel, emulator"
-    return [lab_step(name, "emulator", arguments, minutes=3)]
+    return [lab_step(name, "emulator", marked("emulator"), minutes=3)]
 
 
 def build_step() -> Step:
@@ -225,8 +225,7 @@ def plan_foreign(_form: str) -> list[Step]:
 
 
 def plan_browser(_form: str) -> list[Step]:
-    arguments = ["tests/system", "-m", "browser"]
-    return [lab_step("status page in a browser", "browser", arguments, minutes=1)]
+    return [lab_step("status page in a browser", "browser", marked("browser"), minutes=1)]
 
 
 def plan_openarm(_form: str) -> list[Step]:
@@ -234,8 +233,7 @@ def plan_openarm(_form: str) -> list[Step]:
 
 
 def openarm_step() -> Step:
-    arguments = ["tests/system", "-m", "openarm"]
-    return lab_step("nodes of OpenArm from PyPI", "openarm", arguments, minutes=2)
+    return lab_step("nodes of OpenArm from PyPI", "openarm", marked("openarm"), minutes=2)
 
 
 def plan_machines(_form: str) -> list[Step]:
@@ -363,6 +361,11 @@ def queue_steps(
 def lab_step(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> Step:
     command = ["tests/lab/lab", "run", "--", *PYTEST, *arguments]
     return Step(name, command, in_lab(form), minutes=minutes)
+
+
+def marked(mark: str) -> list[str]:
+    """The system tests of a mark, for pytest."""
+    return [*(str(path.relative_to(CHECKOUT)) for path in marked_files(mark)), "-m", mark]
 
 
 def plan_lint(_form: str) -> list[Step]:

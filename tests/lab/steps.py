@@ -13,9 +13,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import NamedTemporaryFile, TemporaryFile
 from threading import Event, Thread
 
+from lab.cgroup import USAGE
 from lab.definition import CHECKOUT
 from lab.errors import LabError, say
 from lab.process import die_with_parent
@@ -46,7 +47,7 @@ class Step:
 @dataclass(frozen=True)
 class Result:
     """How a step ended. summary: pytest's, or "done". cpu: seconds of processor time, of all that
-    it has started and waited for; that of a container is not in it."""
+    it has started and waited for, and of its containers."""
 
     name: str
     status: int
@@ -112,7 +113,7 @@ def say_results(results: Sequence[Result], seconds: float) -> None:
     """One line for each step, and one for all, as pytest writes it."""
     for result in results:
         word = f"FAILED with exit status {result.status}" if result.status else "ok"
-        used = f"{result.cpu:.0f} s of processor time outside of containers"
+        used = f"{result.cpu:.0f} s of processor time"
         say(f"{result.name}: {word}; {result.summary}; {used}")
     sys.stderr.flush()
     print(f"===== {total(results)} in {seconds:.2f}s =====", flush=True)
@@ -165,11 +166,12 @@ class Running:
         limit = ["timeout", "--foreground", "--kill-after=1m", f"{self.step.longest}m"]
         words = [*limit, *self.step.command] if self.step.longest else self.step.command
         command = die_with_parent(words, "TERM")
-        env = self.step.env()
-        process = subprocess.Popen(command, env=env, cwd=self.step.cwd, stdout=self._output)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        self._cpu = usage.ru_utime + usage.ru_stime
+        with NamedTemporaryFile("r") as used:
+            env = {**self.step.env(), USAGE: used.name}
+            process = subprocess.Popen(command, env=env, cwd=self.step.cwd, stdout=self._output)
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            self._cpu = usage.ru_utime + usage.ru_stime + sum(map(float, used))
         return process.returncode
 
     def finish(self) -> Result:

@@ -68,14 +68,17 @@ nodes:
 
 def wait_for(what: str, condition: Callable[[], T], seconds: float = 30.0) -> T:
     """What `condition` gives as soon as that is true; fails after `seconds` of an idle machine."""
-    begun, pause = time.monotonic(), POLL_SECONDS
+    begun = asked = time.monotonic()
     while not (value := condition()):
-        waited = time.monotonic() - begun
+        now = time.monotonic()
+        waited, taken = now - begun, now - asked
         is_over = waited > seconds and waited > bound(seconds)
         assert not is_over, f"not within {seconds} s, {pace():.1f} times that here: {what}"
-        time.sleep(pause)
-        # What takes long is polled less often: a poll can be a process.
-        pause = max(POLL_SECONDS, min(waited / 10, LONGEST_POLL_SECONDS))
+        # What takes long is polled less often, and so is what costs much: a poll can be a process,
+        # and the other tests need the processor.
+        pause = min(max(waited / 10, 2 * taken), LONGEST_POLL_SECONDS)
+        time.sleep(max(POLL_SECONDS, pause))
+        asked = time.monotonic()
     return value
 
 

@@ -6,6 +6,8 @@ from typing import Protocol, TypeVar
 
 import pytest
 
+from tests.system.usage import Usage
+
 
 class InModule(Protocol):
     """What is looked at of a pytest.Item."""
@@ -17,10 +19,12 @@ class InModule(Protocol):
 Item = TypeVar("Item", bound=InModule)
 LONGEST = (
     *("test_fidelity_exit", "test_restarts", "test_history", "test_transcripts"),
-    *("test_faults", "test_gateway", "test_remote"),
-    *("test_flow_cables", "test_flow_faults", "test_flow"),
+    *("test_faults", "test_gateway", "test_remote", "test_enable", "test_hotreload"),
+    *("test_stop_order", "test_record", "test_logs_flow", "test_versions"),
+    *("test_flow_cables", "test_flow_stop", "test_flow_faults", "test_flow"),
 )
 """Modules that take longest, which a queue begins with."""
+USAGE = pytest.StashKey[Usage]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -31,8 +35,19 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
     queue = session.config.getoption("--queue")
     if not queue or session.config.option.collectonly:
         return None
+    session.config.stash[USAGE] = Usage()
     run_queue(session, queue)
     return True
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
+    """Say what the modules of a queue take, for the next one who looks for minutes."""
+    if USAGE in config.stash:
+        terminalreporter.section("the longest modules")
+        for line in config.stash[USAGE].lines():
+            terminalreporter.write_line(line)
 
 
 def in_order(config: pytest.Config, items: list[pytest.Item]) -> list[pytest.Item]:
@@ -74,7 +89,8 @@ def run_queue(session: pytest.Session, queue: Path) -> None:
     while item:
         # Taken before `item` runs: pytest keeps the fixtures that the next test needs too.
         following = next(taken, None)
-        item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        with session.config.stash[USAGE].of(item.path.stem):
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
         if session.shouldfail:
             raise session.Failed(session.shouldfail)
         if session.shouldstop:

@@ -14,9 +14,10 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from lab import cache, definition, initrd, pace, wire
+from lab import cache, cgroup, definition, initrd, pace, wire
 from lab.changed import find_rooms
 from lab.errors import LabError
+from lab.marked import marked_files
 from lab.options import FORMS, parse_options
 from lab.plans import PLANS, WITH_TOOLS
 from lab.slow import read_speed
@@ -206,6 +207,44 @@ def test_the_processor_time_of_a_step_is_that_of_all_it_waits_for(
     said = capfd.readouterr().err
     assert re.search(r"busy: ok; done; [12] s of processor time", said)
     assert "idle: ok; done; 0 s of processor time" in said
+
+
+def test_the_processor_time_of_containers_is_that_of_the_step(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "cpu.stat").write_text("usage_usec 70000000\nuser_usec 1\n")
+    script = "from lab.cgroup import note_usage; import sys; from pathlib import Path; "
+    script += "note_usage(Path(sys.argv[1])); note_usage(Path('/nowhere'))"
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    place = {**os.environ, "PYTHONPATH": str(definition.CHECKOUT / "tests")}
+    run_steps([Step("lab", command, place.copy), Step("idle", ["true"], os.environ.copy)])
+    said = capfd.readouterr().err
+    assert re.search(r"lab: ok; done; 7[0-5] s of processor time", said)
+    assert "idle: ok; done; 0 s of processor time" in said
+
+
+def test_nobody_has_to_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "cpu.stat").write_text("usage_usec 7\n")
+    monkeypatch.delenv(cgroup.USAGE, raising=False)
+    cgroup.note_usage(tmp_path)
+    assert [one.name for one in tmp_path.iterdir()] == ["cpu.stat"]
+
+
+def test_files_with_a_mark(tmp_path: Path) -> None:
+    texts = {
+        "test_one.py": "@pytest.mark.vm\n",
+        "test_other.py": "@pytest.mark.lab\n",
+        "cells.py": "",
+        "faults/conftest.py": "marks = [pytest.mark.vm]\n",
+        "faults/test_faults.py": "",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    found = [str(path.relative_to(tmp_path)) for path in marked_files("vm", tmp_path)]
+    assert found == ["faults/test_faults.py", "test_one.py"]
+    for mark in ("vm", "emulator", "openarm", "browser"):
+        assert marked_files(mark)
 
 
 STEPS = """

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.system.usage import SHOWN, Usage
 from tests.system.work_queue import longest_first, take_items
 
 
@@ -40,3 +41,23 @@ def test_modules_of_the_same_name_are_two(tmp_path: Path) -> None:
 def test_the_longest_come_first() -> None:
     ordered = longest_first(items("a1", "b1", "b2", "c1"), ["test_c", "test_b"])
     assert [one.name for one in ordered] == ["c1", "b1", "b2", "a1"]
+
+
+def test_what_modules_take(tmp_path: Path) -> None:
+    stat = tmp_path / "cpu.stat"
+    stat.write_text("usage_usec 1000000\nuser_usec 7\n")
+    usage = Usage(stat)
+    for name, used in (("one", 3_000_000), ("two", 3_500_000), ("one", 4_000_000)):
+        with usage.of(name):
+            stat.write_text(f"usage_usec {used}\n")
+    lines = [line.split() for line in usage.lines()]
+    assert {(line[-1], line[2]) for line in lines} == {
+        ("one", "2.5"),
+        ("two", "0.5"),
+        ("modules", "3.0"),
+    }
+    stat.unlink()
+    for number in range(SHOWN + 1):
+        with usage.of(f"more-{number}"):
+            pass
+    assert len(usage.lines()) == SHOWN + 1, "and nobody counts here"
