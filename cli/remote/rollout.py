@@ -12,7 +12,7 @@ from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.remote.printers import Complaints
 from dora_systemd.cli.remote.run import Interrupts, run_on_all
 from dora_systemd.cli.terminal import StageLine
-from dora_systemd.decisions.releases.entries import Stored
+from dora_systemd.decisions.releases.manifest import Stored
 from dora_systemd.decisions.releases.parcel import format_parcel, parse_wants, total
 from dora_systemd.decisions.remote.command_line import with_options, with_output
 from dora_systemd.decisions.remote.hosts import Host, Way

@@ -33,7 +33,7 @@ from dora_systemd.gateway.connection import Gone, ServerSocket
 from dora_systemd.gateway.live.actions import ACTIONS
 from dora_systemd.gateway.routes import OPEN_TO_ALL, SOCKETS, find_route
 from dora_systemd.scope import Scope
-from dora_systemd.trust.socket_table import peer_uid
+from dora_systemd.trust.sockets import peer_uid
 
 log = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
 from dora_systemd.decisions.life.runner_exit import RunnerExit
-from dora_systemd.decisions.logs.fields import encode_entry
+from dora_systemd.decisions.logs.lines import encode_entry
 from dora_systemd.decisions.releases.build import (
     BuildTask,
     is_output,

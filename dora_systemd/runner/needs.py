@@ -13,14 +13,19 @@ from typing import Any
 
 from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.host.inotify import Inotify
-from dora_systemd.adapters.host.links import LinkChanges, look_at_link
-from dora_systemd.adapters.host.presence import Presence, look_at, watched_places
-from dora_systemd.decisions.cell.needs import NET
+from dora_systemd.adapters.host.presence import (
+    LinkChanges,
+    Presence,
+    look_at,
+    look_at_link,
+    watched_places,
+)
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import LATCHED
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
+from dora_systemd.decisions.needs.words import NET
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.reload.apply import Run

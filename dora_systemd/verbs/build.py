@@ -27,6 +27,7 @@ from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.releases.build import (
     BuildTask,
     format_task,
+    project_build_properties,
     project_commands,
     project_environment,
 )
@@ -39,7 +40,6 @@ from dora_systemd.decisions.settings.table import (
     VENV,
     WORKING_DIRECTORY,
 )
-from dora_systemd.decisions.unit.build import project_build_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.trust.programs import own_account, spawn

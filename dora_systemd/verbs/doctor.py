@@ -17,10 +17,10 @@ from dora_systemd.adapters.dora.command import (
     find_dora,
     version_numbers,
 )
-from dora_systemd.adapters.host.interrupts import Interrupts
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.real_time import read_real_time
+from dora_systemd.adapters.host.rivals import Interrupts
 from dora_systemd.adapters.host.unit_files import read_unit_file
 from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN, core_program
@@ -50,7 +50,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
-from dora_systemd.trust.socket_table import TABLES, listening_sockets
+from dora_systemd.trust.sockets import TABLES, listening_sockets
 from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.list import dataflow_row

@@ -1,13 +1,15 @@
 """`doractl list NAME` and JSON: all that is known of dataflows. The table does not load this."""
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 
+from dora_systemd.adapters.bundles.store import BundleStore
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.views.dataflows import is_up_word
-from dora_systemd.decisions.views.rows import DataflowRow
+from dora_systemd.decisions.views.rows import Bundles, DataflowRow
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
-from dora_systemd.verbs.facts.bundles import mark_bundles
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.containers import read_containers
 from dora_systemd.verbs.facts.list import mark_enabled, row_of
@@ -64,3 +66,16 @@ def with_containers(reading: Reading, row: DataflowRow) -> DataflowRow:
         return row
     nodes = (one._replace(containers=found.get(one.node, ())) for one in row.nodes)
     return row._replace(nodes=tuple(nodes))
+
+
+def read_of_failures(scope: Scope, name: str) -> Bundles | None:
+    """What failures of a dataflow have left; None if that is nothing, or may not be read."""
+    with suppress(DoraSystemdError):
+        found = BundleStore(scope.state_root, name).of_failures()
+        return found if found != Bundles() else None
+    return None
+
+
+def mark_bundles(scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:
+    """The rows with what failures have left."""
+    return [row._replace(bundles=read_of_failures(scope, row.name)) for row in rows]

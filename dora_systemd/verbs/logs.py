@@ -17,7 +17,7 @@ from dora_systemd.adapters.journal.journalctl import (
     journal_output,
     open_journalctl,
 )
-from dora_systemd.decisions.logs.fields import ExportReader
+from dora_systemd.decisions.logs.lines import ExportReader
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
     LogQuery,

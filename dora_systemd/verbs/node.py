@@ -13,8 +13,7 @@ from dora_systemd.adapters.runner_socket import client as runner_socket
 from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.status import PROTOCOL
 from dora_systemd.decisions.dora.command import coordinator_variables, parse_node_command
-from dora_systemd.decisions.dora.coordinator import Coordinator
-from dora_systemd.decisions.dora.protocol import Params, Reply
+from dora_systemd.decisions.dora.protocol import Coordinator, Params, Reply
 from dora_systemd.decisions.life.stop_budget import answer_timeout
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean

@@ -33,10 +33,10 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.enabled import enabled_units
-from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.reload import Ask, limit_lines, remember, variables_of
 from dora_systemd.verbs.start.limits import read_machine, require_controllers
+from dora_systemd.verbs.start.read import written_dataflow
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
 

@@ -23,7 +23,7 @@ from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
-from dora_systemd.trust.socket_table import listener_uids, listening_sockets
+from dora_systemd.trust.sockets import listener_uids, listening_sockets
 from dora_systemd.verbs.doctor import examine
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.enabled import enabled_names, own_directories

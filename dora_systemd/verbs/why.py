@@ -28,7 +28,6 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import read_restarts, restart_budget, without_refused
-from dora_systemd.verbs.facts.bundles import mark_bundles, read_of_failures
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.containers import read_containers
 from dora_systemd.verbs.facts.ended import newest_ended, not_recorded
@@ -40,7 +39,7 @@ from dora_systemd.verbs.facts.reading import look_at_table, read_dataflow, read_
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.stack import read_pattern, read_stack
 from dora_systemd.verbs.facts.waits import read_cpu_waits
-from dora_systemd.verbs.list import read_whole_rows
+from dora_systemd.verbs.list import mark_bundles, read_of_failures, read_whole_rows
 
 _MOST_SHUTDOWNS = 20
 _FEWEST_LINES = 5

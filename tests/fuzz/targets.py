@@ -25,12 +25,12 @@ from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.exits import parse_exit
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow, parse_session
-from dora_systemd.decisions.dora.coordinator import parse_coordinator
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.decisions.dora.life_events import parse_daemon_line, parse_life_event
 from dora_systemd.decisions.dora.protocol import (
     LogRecord,
     Reply,
+    parse_coordinator,
     parse_frame,
     parse_heartbeat,
     parse_heartbeats,

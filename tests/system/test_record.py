@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.recorder.mcap import write_recording
 from dora_systemd.decisions.recorder.reading import Reading, Recorded
-from dora_systemd.decisions.recorder.recording import write_recording
 from dora_systemd.trust.rings import find_ring
 from tests.system.cells import Cell, Project, wait_for
 from tests.unit.fakes.recorder.mcap import File

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.host.interrupts import Interrupts
+from dora_systemd.adapters.host.rivals import Interrupts
 from dora_systemd.values import cpu_numbers
 from tests.system.cells import Cell, Project, run, wait_for
 

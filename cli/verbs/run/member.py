@@ -13,9 +13,7 @@ from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.machines.address import parse_address
-from dora_systemd.decisions.machines.key import ORIGINAL, forced_words
 from dora_systemd.decisions.machines.link_command import RESTRICTED
-from dora_systemd.decisions.machines.push import PLACE, format_place
 from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.decisions.settings.resolve import SET
 from dora_systemd.decisions.settings.table import SETTINGS
@@ -28,7 +26,8 @@ from dora_systemd.verbs.machines.member import (
     is_passing,
     start_member,
 )
-from dora_systemd.verbs.machines.push import place_problem
+from dora_systemd.verbs.machines.push import PLACE, format_place, place_problem
+from dora_systemd.verbs.machines.register import ORIGINAL, forced_words
 from dora_systemd.verbs.start.request import StartRequest
 from dora_systemd.verbs.version import own_facts
 

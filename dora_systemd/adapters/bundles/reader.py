@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from dora_systemd.adapters.bundles.archive import BLOCK
+from dora_systemd.adapters.bundles.store import BLOCK
 from dora_systemd.decisions.bundles.manifest import (
     MANIFEST,
     MOST_MANIFEST,

@@ -14,8 +14,7 @@ from dora_systemd.adapters.dora.command import dora_version, find_dora, refusal_
 from dora_systemd.adapters.host.files import parse_yaml, read_text
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.decisions.descriptor.expansion import unset_variables
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow, unset_variables
 from dora_systemd.decisions.dora.errors import UNNAMED, UNSET, UNSET_OR_OTHER, name_input
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account

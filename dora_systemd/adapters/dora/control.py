@@ -7,12 +7,13 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator
 from dora_systemd.decisions.dora.protocol import (
+    Coordinator,
     LogRecord,
     Params,
     Reply,
     encode_request,
+    parse_coordinator,
     parse_frame,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of

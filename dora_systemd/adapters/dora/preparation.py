@@ -66,7 +66,7 @@ def prepare(
 
         probe_python(plan)
     if options.has("record"):
-        from dora_systemd.adapters.dora.recorder import check_recorder
+        from dora_systemd.adapters.dora.probe import check_recorder
 
         check_recorder(plan)
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))

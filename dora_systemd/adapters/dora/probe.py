@@ -1,5 +1,6 @@
-"""Finds a Python that can run the probe, see decisions/owes/probe.py."""
+"""Finds a Python with dora-rs for the probe and the recorder, see decisions/owes/ and recorder/."""
 
+import os
 import sys
 from collections.abc import Iterator, Sequence
 
@@ -51,3 +52,27 @@ def _with_module(command: Sequence[str], plan: LaunchPlan, module: str) -> str:
     except DoraSystemdError:
         return ""  # there is no such program
     return done.stdout.strip() if done.status == 0 else ""
+
+
+_RECORDING = "record outputs"
+
+
+def recorder_python(plan: LaunchPlan) -> str:
+    """The absolute path of a Python with dora-rs. Raises DoraSystemdError (BAD_INPUT)."""
+    return probe_python(plan, purpose=_RECORDING)
+
+
+def total_memory() -> int:
+    """Bytes of memory of this machine."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def check_recorder(plan: LaunchPlan) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) if the recorder has no Python, or no memory."""
+    record = plan.options.of_dataflow("record")
+    if record is not None:
+        # Imported late: what owes outputs has no recorder in most cases.
+        from dora_systemd.decisions.recorder.record import check_memory
+
+        check_memory(record, total_memory())
+        recorder_python(plan)

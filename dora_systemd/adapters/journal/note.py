@@ -10,8 +10,8 @@ import socket
 from collections.abc import Mapping
 from contextlib import suppress
 
-from dora_systemd.decisions.logs.fields import encode_entry
 from dora_systemd.decisions.logs.journal_events import event_fields
+from dora_systemd.decisions.logs.lines import encode_entry
 from dora_systemd.trust.paths import user_name
 
 JOURNAL_SOCKET = "/run/systemd/journal/socket"

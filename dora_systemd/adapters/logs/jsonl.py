@@ -11,8 +11,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from dora_systemd.decisions.logs.fields import Value
-from dora_systemd.decisions.logs.lines import LineSplitter, jsonl_fields
+from dora_systemd.decisions.logs.lines import LineSplitter, Value, jsonl_fields
 
 POLL_SECONDS = 0.05
 # Bytes to read before the loop does other work.

@@ -22,9 +22,15 @@ from dora_systemd.adapters.logs.held import HeldLines, held_path, read_held
 from dora_systemd.adapters.logs.queue import Journal, LogQueue
 from dora_systemd.adapters.logs.source import CHUNK, PIPE_SIZE, OnLine, Pipe, Source, fifos
 from dora_systemd.decisions.cell.line_rates import LineLimiter, RateLimit, format_rate
-from dora_systemd.decisions.logs.fields import Value, encode_entry
 from dora_systemd.decisions.logs.journal_events import event_fields
-from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin, dora_log_fields
+from dora_systemd.decisions.logs.lines import (
+    LineEncoder,
+    LineSplitter,
+    Origin,
+    Value,
+    dora_log_fields,
+    encode_entry,
+)
 from dora_systemd.decisions.logs.noise import is_end_of
 from dora_systemd.decisions.resources.usage import WHOLE_CELL, LineCount
 from dora_systemd.paths import CellPaths

@@ -12,8 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from dora_systemd.adapters.releases.store import MANIFEST, Store, remove_tree, stored_at, write_part
-from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.manifest import Manifest, format_manifest
+from dora_systemd.decisions.releases.manifest import Manifest, Stored, format_manifest
 from dora_systemd.names import TREE
 from dora_systemd.trust.paths import sync_directory
 

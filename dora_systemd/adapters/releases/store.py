@@ -13,8 +13,12 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
+from dora_systemd.decisions.releases.manifest import (
+    Manifest,
+    Stored,
+    format_manifest,
+    parse_manifest,
+)
 from dora_systemd.decisions.releases.past import (
     MOST_LINES,
     Known,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store, make_directories, remove_tree, unusable
-from dora_systemd.decisions.releases.entries import Stored
+from dora_systemd.decisions.releases.manifest import Stored
 from dora_systemd.errors import DoraSystemdError
 
 _DIRECTORY = "/var/tmp"

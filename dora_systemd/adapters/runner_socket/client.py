@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd import __version__
-from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator, parse_token
+from dora_systemd.decisions.dora.protocol import Coordinator, parse_coordinator, parse_token
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.sockets import connect_unix, plain
 from dora_systemd.values import as_mapping, quoted

@@ -14,9 +14,9 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from dora_systemd.adapters.runner_socket.client import relay
-from dora_systemd.adapters.runner_socket.splice import Ends, splice
+from dora_systemd.adapters.runner_socket.listener import Ends, splice
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.trust.socket_table import peer_uid
+from dora_systemd.trust.sockets import peer_uid
 
 _LOOPBACK = "127.0.0.1"
 

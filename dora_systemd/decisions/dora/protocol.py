@@ -1,13 +1,13 @@
 """dora's control protocol as its client uses it: frames to values and back. No socket, no clock.
 
 The frames are those of dora 1.0 and 1.1 on `/api/control`; dora's docs/websocket-control-plane.md
-documents some of them.
+documents some of them. The runner writes and reports the address and token of its coordinator.
 """
 
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import takewhile
 from math import isfinite
 from typing import Any
@@ -16,6 +16,46 @@ from uuid import uuid4
 from dora_systemd.decisions.cell.exits import Exit, ExitKind
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND, as_list, as_mapping
+
+_TOKEN_TEXT = re.compile(r"[0-9A-Za-z._~+/=-]{1,512}")
+"""The characters of a token in an HTTP header: RFC 6750, section 2.1."""
+
+
+@dataclass(frozen=True)
+class Coordinator:
+    """Ports of 127.0.0.1 and a token."""
+
+    # port, token: of the coordinator
+    port: int
+    token: str
+    # the daemon's port for dynamic nodes; None if they cannot reach it
+    local_listen_port: int | None
+
+    def raw(self) -> dict[str, Any]:
+        """The values for JSON; parse_coordinator reads them."""
+        return asdict(self)
+
+
+def parse_coordinator(raw: object) -> Coordinator:
+    """Parse the address of a coordinator. Raises ValueError if it is not valid."""
+    if not isinstance(raw, dict):
+        raise ValueError("not an object")
+    port, listen = (_port(raw.get(key)) for key in ("port", "local_listen_port"))
+    return Coordinator(port, parse_token(raw.get("token")), listen)
+
+
+def parse_token(raw: object) -> str:
+    """Parse the token of a coordinator. Raises ValueError if it is not valid."""
+    if not isinstance(raw, str) or not _TOKEN_TEXT.fullmatch(raw):
+        raise ValueError("not a token")
+    return raw
+
+
+def _port(raw: object) -> int:
+    if type(raw) is not int or not 0 < raw < 65536:
+        raise ValueError("not a port")
+    return raw
+
 
 Params = str | Mapping[str, Any]
 

@@ -16,18 +16,23 @@ from dataclasses import replace
 from dora_systemd.decisions.cell.exits import parse_exit
 from dora_systemd.decisions.cell.owes import FAIL
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus, is_stopped
-from dora_systemd.decisions.life import early, stop_order
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import node_table as table
+from dora_systemd.decisions.life import stop_order
 from dora_systemd.decisions.life.causes import ESSENTIAL, Cause
 from dora_systemd.decisions.life.failures import (
     ENGINE_TIMEOUT,
     Next,
     because,
+    blamed_early,
+    blamed_early_results,
     broken,
     fail,
+    is_doomed,
+    noted_early,
     oom_of_all,
     to,
+    with_early_cause,
 )
 from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import (
@@ -79,7 +84,7 @@ def barrier_opened(cell: Cell, event: life.Event) -> Next:
     """Let the dataflow run after dora has opened its start barrier, unless a node failed before."""
     # Dora also opens the barrier after a node ended before it was ready, and then fails the other
     # nodes: RunFinished follows. If it does not follow within CASCADE_TIMEOUT, the dataflow runs.
-    if any(node.state == "failed" for node in cell.nodes.values()) or early.is_doomed(cell):
+    if any(node.state == "failed" for node in cell.nodes.values()) or is_doomed(cell):
         return cell, (Deadline(CASCADE_TIMEOUT),)
     return run(cell, event)
 
@@ -225,10 +230,10 @@ def node_event_waiting(cell: Cell, event: life.NodeExited) -> Next:
     A node with the policy HELD waits for a reload after it failed. That is no help while the start
     can still fail: on the first run, and in a trial, where the version before can come back.
     """
-    event = early.with_cause(cell, event)
-    blamed, records = early.blamed(cell, event)
+    event = with_early_cause(cell, event)
+    blamed, records = blamed_early(cell, event)
     after, actions = node_event(blamed, event)
-    after, actions = early.noted(cell, after, event.node), (*records, *actions)
+    after, actions = noted_early(cell, after, event.node), (*records, *actions)
     node = after.nodes[event.node]
     if node.state == "failed" and node.policy == LATCHED:
         return _fail_early(after, event.node, actions)
@@ -251,7 +256,7 @@ def run_finished(cell: Cell, event: life.Event) -> Next:
 
 def result(cell: Cell, event: life.ResultKnown) -> Next:
     """Decide by the results of the nodes between a finished and a failed dataflow."""
-    event = replace(event, results=early.blamed_results(event.results))
+    event = replace(event, results=blamed_early_results(event.results))
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
         lost = because(cell, Cause.NO_ANSWER)

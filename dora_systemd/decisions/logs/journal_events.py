@@ -6,8 +6,7 @@ the two. Never change or reuse a MESSAGE_ID: https://systemd.io/CATALOG
 
 from dataclasses import dataclass
 
-from dora_systemd.decisions.logs.fields import Value, legal_name
-from dora_systemd.decisions.logs.lines import ERR, INFO, NOTICE, WARNING
+from dora_systemd.decisions.logs.lines import ERR, INFO, NOTICE, WARNING, Value, legal_name
 
 
 @dataclass(frozen=True)

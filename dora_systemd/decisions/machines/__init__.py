@@ -6,7 +6,7 @@
 `deploy:` and the setting `machines`. `part.py` makes the part of a machine: the head sends one
 descriptor, which names the machine of a member's node, and the file `launch/NODE` there has its
 program. `member.py` makes the command line of `doractl member`: it stands in the unit of a link,
-and never comes from a runner. `key.py` has what the key of `doractl machine add` may do.
+and never comes from a runner. The key of `doractl machine add` is in `verbs/machines/register.py`.
 
 systemd owns a link (`link_unit.py`). The unit of the head wants it, so whatever starts the head
 starts the link, in one transaction. StopWhenUnneeded= ends it with the head, but not while the head

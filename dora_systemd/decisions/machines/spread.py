@@ -12,13 +12,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from dora_systemd.decisions.cell.launch import is_launched
 from dora_systemd.decisions.cell.machines import HEAD, Placed, is_host_name, members_of
-from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import owes_of
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, Node, mapping_of
-from dora_systemd.decisions.machines.entry import DIRECT, Machine, parse_entry
-from dora_systemd.decisions.machines.member import Member, member_of, on_head
+from dora_systemd.decisions.machines.member import (
+    DIRECT,
+    Machine,
+    Member,
+    member_of,
+    on_head,
+    parse_entry,
+)
+from dora_systemd.decisions.needs.words import needs_of
 from dora_systemd.decisions.properties.sandbox import DEFAULT_NETWORK
 from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.decisions.settings.reload import HOT_RELOAD

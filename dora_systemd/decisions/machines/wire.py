@@ -29,7 +29,7 @@ MAX_TEXT = 1000
 LOWEST_PORT, HIGHEST_PORT = 1024, 65535
 PORT_RANGE = range(61000, 61200)
 """Where the head chooses ports that have to be free on all machines: outside of Linux's ephemeral
-ports, see ip_local_port_range in ip(7). The key of a machine names each of them, see key.py."""
+ports, see ip_local_port_range in ip(7). The key of a machine names each of them."""
 
 
 @dataclass(frozen=True)

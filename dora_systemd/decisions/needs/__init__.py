@@ -1,1 +1,1 @@
-"""What nodes wait for: steps, dependencies of the unit, devices of the sandbox."""
+"""What nodes wait for: the words of `needs`, steps, dependencies of the unit, devices."""

@@ -12,7 +12,7 @@ bus is opened by its socket family.
 import re
 from collections.abc import Iterable
 
-from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NET, NETWORK, UNIT, NodeNeed
+from dora_systemd.decisions.needs.words import CLOCK, DATAFLOW, MOUNT, NET, NETWORK, UNIT, NodeNeed
 from dora_systemd.decisions.properties.assignments import typed, with_assignments
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.names import name_from_unit, unit_name

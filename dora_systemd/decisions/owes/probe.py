@@ -12,6 +12,7 @@ owed output, in their order, and for each other input of the nodes that owe them
 itself, is starved.
 """
 
+import shlex
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,8 +20,41 @@ from typing import Any
 
 from dora_systemd.decisions.cell.owes import PROBE, Owed
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, downstream_of
-from dora_systemd.decisions.owes.extra_node import extra_definition
 from dora_systemd.values import SECOND
+
+_VARIABLES = {
+    # One thread of dora's is enough for it. Each further one has an arena of malloc(3).
+    "TOKIO_WORKER_THREADS": "1",
+    "MALLOC_ARENA_MAX": "1",
+    "RUST_LOG": "error",
+}
+
+
+def extra_definition(
+    name: str,
+    number: int,
+    command: Sequence[str],
+    launcher: tuple[str, str],
+    inputs: Mapping[str, Mapping[str, Any]],
+    variables: Mapping[str, str],
+) -> dict[str, Any]:
+    """The node for dora's descriptor. name: of its group, and the beginning of its id.
+
+    number: of earlier nodes of that name in this run. command: the program. launcher: what executes
+    the program.
+    """
+    interpreter, script = launcher
+    return {
+        "id": f"{name}.{number}",
+        "path": interpreter,
+        "args": shlex.join([script, name, "/", "keep", *command]),
+        "inputs": {key: dict(one) for key, one in inputs.items()},
+        "env": {**_VARIABLES, **variables},
+        "restart_policy": "never",
+        "max_log_size": "64KB",
+        "max_rotated_files": 1,
+    }
+
 
 _SLOT = struct.Struct("=Q")
 

@@ -8,8 +8,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from dora_systemd.decisions.cell.environment import parse_assignment
-from dora_systemd.decisions.properties.kinds import PropertyKind, plain_text
-from dora_systemd.decisions.properties.syntax import escape_specifiers, quote_word, split_words
+from dora_systemd.decisions.properties.kinds import (
+    PropertyKind,
+    escape_specifiers,
+    plain_text,
+    quote_word,
+    split_words,
+)
 
 Condition = tuple[str, bool, bool, str]
 

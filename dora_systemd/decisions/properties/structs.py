@@ -18,9 +18,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from dora_systemd.decisions.properties import kinds
-from dora_systemd.decisions.properties.kinds import PropertyKind, plain_text
+from dora_systemd.decisions.properties.kinds import (
+    PropertyKind,
+    escape_specifiers,
+    plain_text,
+    quote_word,
+    split_words,
+)
 from dora_systemd.decisions.properties.lists import items_kind, marked, words_kind
-from dora_systemd.decisions.properties.syntax import escape_specifiers, quote_word, split_words
 from dora_systemd.values import INFINITY, parse_size
 
 Pair = tuple[str, str]

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from dora_systemd.decisions.releases.entries import (
+from dora_systemd.decisions.releases.manifest import (
     FILE,
     LINK,
     MOST_FILES,
@@ -18,10 +18,12 @@ from dora_systemd.decisions.releases.entries import (
     Stored,
     check_amount,
     check_found,
+    format_stored,
     is_plain_path,
+    is_revision,
+    parse_stored,
     too_many,
 )
-from dora_systemd.decisions.releases.manifest import format_stored, is_revision, parse_stored
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name
 from dora_systemd.values import as_mapping

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.logs.fields import ExportReader
+from dora_systemd.decisions.logs.lines import ExportReader
 from dora_systemd.decisions.remote.stream import Lines, read_json
 
 WINDOW_SECONDS = 0.6

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from operator import add
 
 from dora_systemd.decisions.cell.launch import is_launched
-from dora_systemd.decisions.cell.needs import (
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.nodes import Node
+from dora_systemd.decisions.needs.words import (
     FOREIGN,
     check_needs,
     needs_of,
     parse_needs,
     parse_node_needs,
 )
-from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.settings.kinds import Setting, many_texts
 
 

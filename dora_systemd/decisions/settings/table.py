@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.decisions.cell.options import DEFAULT_GRACE
-from dora_systemd.decisions.settings.credentials import CREDENTIAL_SETTINGS
 from dora_systemd.decisions.settings.kinds import (
     BOOL,
     DURATION,
@@ -30,7 +29,7 @@ from dora_systemd.decisions.settings.record import RECORD_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.rights import RIGHTS_SETTINGS
-from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
+from dora_systemd.decisions.settings.sandbox import CREDENTIAL_SETTINGS, SANDBOX_SETTINGS
 from dora_systemd.decisions.settings.stops import STOP_SETTINGS
 
 ENV = Setting[Mapping[str, str]]("env", ENVIRONMENT, {}, "Environment variable of all nodes.")

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dora_systemd.decisions.cell.environment import checked_variable, environment_entries
-from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     post_command,
@@ -20,6 +19,7 @@ from dora_systemd.decisions.cell.rights import NICE_LIMIT, NodeRights, rights_of
 from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.stop_budget import unit_timeout
 from dora_systemd.decisions.needs.units import NETWORK_UNIT, device_entries, needs_properties
+from dora_systemd.decisions.needs.words import needs_of
 from dora_systemd.decisions.properties.assignments import (
     NOTHING_NEWER,
     Newer,
@@ -34,10 +34,10 @@ from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.sandbox import Sandbox, sandbox_properties
 from dora_systemd.decisions.properties.structs import Command
 from dora_systemd.decisions.properties.table import TABLE
-from dora_systemd.decisions.settings.credentials import credential_properties
 from dora_systemd.decisions.settings.limits import REALTIME
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.decisions.settings.sandbox import credential_properties
 from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -7,7 +7,7 @@ a user, below the user's data directory, see file-hierarchy(7).
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from dora_systemd.decisions.properties.syntax import quote_word
+from dora_systemd.decisions.properties.kinds import quote_word
 
 SYSTEM_ROOT = "/"
 PACKAGED_UNIT = "/usr/lib/systemd/system/dora.slice"

@@ -3,8 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.resources.interrupts import Shared
-from dora_systemd.decisions.resources.rivals import Rival
+from dora_systemd.decisions.resources.rivals import Rival, Shared
 from dora_systemd.values import SECOND
 
 WORTH_SHOWING = 20.0

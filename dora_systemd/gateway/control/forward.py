@@ -22,9 +22,9 @@ from dora_systemd.gateway.control.state import ended_descriptor
 from dora_systemd.scope import Scope
 from dora_systemd.values import as_mapping
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.node import NodeOrder, order_node, require_running, socket_of
+from dora_systemd.verbs.start.read import written_dataflow
 
 _GOING_AWAY = 1001
 

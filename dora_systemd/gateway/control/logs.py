@@ -15,7 +15,7 @@ from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.answers import is_from_systemd, is_wanted, log_line
 from dora_systemd.decisions.gateway.frames import LOGS_LIMIT, Request, format_event, logs_parts
-from dora_systemd.decisions.logs.fields import ExportReader
+from dora_systemd.decisions.logs.lines import ExportReader
 from dora_systemd.decisions.logs.query import end_matches, journal_timestamp, scope_matches
 from dora_systemd.decisions.logs.records import (
     LOG_FIELDS,

@@ -22,9 +22,7 @@ from dora_systemd.decisions.gateway.request import Request as HttpRequest
 from dora_systemd.decisions.gateway.request import Socket
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.control import forward as cell
-from dora_systemd.gateway.control import logs, state
-from dora_systemd.gateway.control import start as starting
-from dora_systemd.gateway.control import stop as stopping
+from dora_systemd.gateway.control import jobs, logs, state
 from dora_systemd.gateway.control.session import Result, Talk
 
 log = logging.getLogger(__name__)
@@ -116,10 +114,10 @@ HANDLERS: dict[str, Handler] = {
     "GetNodeInfo": lambda talk, _: asyncio.to_thread(state.list_nodes, talk.scope),
     "Check": lambda talk, request: asyncio.to_thread(state.check, talk.scope, request.dataflow),
     "Info": cell.describe,
-    "Start": starting.start,
-    "WaitForSpawn": starting.wait_for_spawn,
-    **dict.fromkeys(("Stop", "StopByName"), stopping.stop),
-    **dict.fromkeys(("Restart", "RestartByName"), stopping.restart),
+    "Start": jobs.start,
+    "WaitForSpawn": jobs.wait_for_spawn,
+    **dict.fromkeys(("Stop", "StopByName"), jobs.stop),
+    **dict.fromkeys(("Restart", "RestartByName"), jobs.restart),
     "Logs": logs.send_logs,
     "LogSubscribe": logs.subscribe_logs,
     "RestartNode": cell.restart_one_node,

@@ -24,9 +24,9 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_rows
 from dora_systemd.verbs.facts.list import read_rows
-from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reason import failure_reason, logs_hint
 from dora_systemd.verbs.follow import is_unit_up
+from dora_systemd.verbs.start.read import written_dataflow
 from dora_systemd.verbs.why import explain, words_of_start
 
 _MOST_ENDED = 20

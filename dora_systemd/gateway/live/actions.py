@@ -21,7 +21,6 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.locks import require_uninhibited
-from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import ask_coordinator
@@ -30,6 +29,7 @@ from dora_systemd.verbs.restart import act_on, told
 from dora_systemd.verbs.set import set_limits
 from dora_systemd.verbs.start.enable import disable_cell, enable_cell
 from dora_systemd.verbs.start.logins import ensure_linger
+from dora_systemd.verbs.start.read import written_dataflow
 from dora_systemd.verbs.start.restart_ended import find_start
 from dora_systemd.verbs.start.start import restart_asked
 

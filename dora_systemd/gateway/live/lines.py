@@ -14,7 +14,7 @@ from dora_systemd.adapters.journal.journalctl import end_journalctl
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage, line_values
-from dora_systemd.decisions.logs.fields import ExportReader
+from dora_systemd.decisions.logs.lines import ExportReader
 from dora_systemd.decisions.logs.query import LogQuery, query_arguments
 from dora_systemd.decisions.logs.records import lines_elsewhere
 from dora_systemd.scope import Scope

@@ -18,8 +18,7 @@ from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.client import Request
 from dora_systemd.adapters.runner_socket.door import Door
-from dora_systemd.adapters.runner_socket.listener import Session, refuse
-from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.adapters.runner_socket.listener import Ends, Session, refuse
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import format_missing, members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions

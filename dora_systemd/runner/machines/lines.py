@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 from collections.abc import Callable
 
-from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.adapters.runner_socket.listener import Ends
 from dora_systemd.decisions.machines.wire import (
     BEAT_SECONDS,
     LEASE_SECONDS,

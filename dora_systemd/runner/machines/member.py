@@ -19,7 +19,7 @@ from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host import files
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.adapters.runner_socket.splice import Ends, taken_over
+from dora_systemd.adapters.runner_socket.listener import Ends, taken_over
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import RESTART, STOP, CellStatus

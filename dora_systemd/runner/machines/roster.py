@@ -10,8 +10,7 @@ from functools import partial
 
 from dora_systemd import __version__
 from dora_systemd.adapters.runner_socket.client import Request
-from dora_systemd.adapters.runner_socket.listener import refuse
-from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.adapters.runner_socket.listener import Ends, refuse
 from dora_systemd.decisions.cell.machines import (
     NOT_CONNECTED,
     NOT_JOINED,

@@ -16,6 +16,8 @@ from dora_systemd.runner.reload.apply import Run
 from dora_systemd.values import SECOND
 
 Define = Callable[[], Awaitable[dict[str, Any]]]
+FindPython = Callable[[], Awaitable[str]]
+"""Of the interpreter with dora-rs; raises DoraSystemdError if there is none."""
 
 _SOON, LATE = SECOND, 32 * SECOND
 """µs between two nodes; the pause doubles while none lives for LATE."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.adapters.bundles.archive import Section, Sink
+from dora_systemd.adapters.bundles.store import Section, Sink
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_strain
@@ -16,14 +16,15 @@ from dora_systemd.decisions.bundles.allowlist import (
     OF_SERVICE,
     OF_UNIT,
     VARIABLES,
+    export_entry,
     is_kill_of,
     kept_findings,
     kept_properties,
     kept_report,
     kept_row,
     kept_status,
+    of_lives,
 )
-from dora_systemd.decisions.bundles.export import export_entry, of_lives
 from dora_systemd.decisions.bundles.manifest import WHY
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.logs.query import bundle_matches, kernel_matches

@@ -5,12 +5,12 @@ import pwd
 from contextlib import closing
 from functools import partial
 
-from dora_systemd.adapters.bundles.archive import Section, Sink
+from dora_systemd.adapters.bundles.store import Section, Sink
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.recorder.mcap import write_recording
 from dora_systemd.decisions.recorder.pictures import Picture, find_pictures
 from dora_systemd.decisions.recorder.reading import Reading
-from dora_systemd.decisions.recorder.recording import write_recording
 from dora_systemd.scope import Scope
 from dora_systemd.trust.rings import RingFile, find_ring
 from dora_systemd.verbs.facts.cells import Cell

@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dora_systemd import __version__
-from dora_systemd.adapters.bundles.archive import Archive, Section, Sink
 from dora_systemd.adapters.bundles.reader import opened
 from dora_systemd.adapters.bundles.store import (
     LEAST,
     REQUESTED,
     STAMP,
+    Archive,
     BundleStore,
+    Section,
+    Sink,
     Stored,
     locked,
     room,

@@ -10,19 +10,25 @@ from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_waited
-from dora_systemd.adapters.host.interrupts import Interrupts
 from dora_systemd.adapters.host.process_table import PROC, process_group
-from dora_systemd.adapters.host.process_times import (
+from dora_systemd.adapters.host.rivals import (
     TICKS,
+    Interrupts,
     read_delay,
     read_thread_cpus,
     read_times,
 )
 from dora_systemd.decisions.cell.limits import CPUS, limits_of
-from dora_systemd.decisions.cell.needs import NET, needs_of
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.resources.interrupts import Interrupt, Shared, share_interrupts
-from dora_systemd.decisions.resources.rivals import Rival, busiest, on_cpus
+from dora_systemd.decisions.needs.words import NET, needs_of
+from dora_systemd.decisions.resources.rivals import (
+    Interrupt,
+    Rival,
+    Shared,
+    busiest,
+    on_cpus,
+    share_interrupts,
+)
 from dora_systemd.decisions.resources.usage import WHOLE_CELL
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.waits import MINUTE, WORTH_SHOWING, CpuWait

@@ -39,8 +39,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
-from dora_systemd.trust.socket_table import is_open_beyond
-from dora_systemd.trust.sockets import plain
+from dora_systemd.trust.sockets import is_open_beyond, plain
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal

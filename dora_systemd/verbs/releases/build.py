@@ -26,10 +26,11 @@ from dora_systemd.decisions.logs.journal_events import BUILD_FAILED
 from dora_systemd.decisions.releases.build import (
     BuildTask,
     build_environment,
+    build_properties,
     build_unit,
     format_task,
 )
-from dora_systemd.decisions.releases.entries import (
+from dora_systemd.decisions.releases.manifest import (
     DIRECTORY,
     FILE,
     LINK,
@@ -42,7 +43,6 @@ from dora_systemd.decisions.releases.entries import (
     too_many,
 )
 from dora_systemd.decisions.releases.progress import copying
-from dora_systemd.decisions.unit.build import build_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import reached

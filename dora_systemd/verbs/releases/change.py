@@ -21,8 +21,8 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.logs.journal_events import ROLLED_BACK
 from dora_systemd.decisions.releases.progress import Step, going_back, judged, stopping, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
-from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.decisions.why.remedies import known_remedy
+from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.names import notice_unit, unit_name
 from dora_systemd.scope import Scope

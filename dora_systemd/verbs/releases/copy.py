@@ -13,8 +13,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.releases.build import build_commands
-from dora_systemd.decisions.releases.entries import Found, Stored
-from dora_systemd.decisions.releases.manifest import Manifest, new_id
+from dora_systemd.decisions.releases.manifest import Found, Manifest, Stored, new_id
 from dora_systemd.decisions.releases.progress import building, copied, copying
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope

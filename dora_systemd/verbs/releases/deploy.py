@@ -10,8 +10,15 @@ from typing import NamedTuple
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.releases.entries import FILE, LINK, Found, Stored, of_project, touched
-from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.manifest import (
+    FILE,
+    LINK,
+    Found,
+    Manifest,
+    Stored,
+    of_project,
+    touched,
+)
 from dora_systemd.decisions.releases.past import surplus
 from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.settings.differences import lost_options

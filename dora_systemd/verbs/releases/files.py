@@ -12,19 +12,20 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
-from dora_systemd.decisions.releases.entries import (
+from dora_systemd.decisions.releases.manifest import (
     DIRECTORY,
     LINK,
     MOST_FILES,
     Found,
+    Manifest,
     Stored,
     check_amount,
     check_found,
+    is_revision,
     refusal,
     settled,
     too_many,
 )
-from dora_systemd.decisions.releases.manifest import Manifest, is_revision
 from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT
 from dora_systemd.trust.project import Project
 

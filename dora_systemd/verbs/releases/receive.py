@@ -17,7 +17,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.adapters.releases.transfer import Stream, incoming
-from dora_systemd.decisions.releases.entries import Stored, of_project, touched
+from dora_systemd.decisions.releases.manifest import Stored, of_project, touched
 from dora_systemd.decisions.releases.parcel import (
     MOST_HEAD,
     Parcel,

@@ -10,7 +10,7 @@ from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import before
 from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.unit.file import runner_of
-from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean, unit_name
 from dora_systemd.scope import Scope

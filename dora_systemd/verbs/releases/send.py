@@ -12,7 +12,7 @@ from typing import NamedTuple
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.adapters.releases.transfer import Spool, spooled
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
-from dora_systemd.decisions.releases.entries import Found, Stored, refusal
+from dora_systemd.decisions.releases.manifest import Found, Stored, refusal
 from dora_systemd.decisions.releases.parcel import Parcel
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.table import ENV_FILE, VENV, WORKING_DIRECTORY

@@ -16,9 +16,15 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import Owed, owes_of
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.releases.progress import Step, soaking, starting, stopping
-from dora_systemd.decisions.why.faults import FAULT_IDS, WAITING, Fault, find_fault, is_finished
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
 from dora_systemd.decisions.why.lives import Happening, parse_happening
+from dora_systemd.decisions.why.trial_faults import (
+    FAULT_IDS,
+    WAITING,
+    Fault,
+    find_fault,
+    is_finished,
+)
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope

@@ -9,7 +9,7 @@ from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind, operator_file
 from dora_systemd.decisions.releases.build import built_nodes, has_builds, is_moving, lock_places
-from dora_systemd.decisions.releases.entries import refusal
+from dora_systemd.decisions.releases.manifest import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path

@@ -32,7 +32,7 @@ from dora_systemd.decisions.releases.past import (
     marks,
 )
 from dora_systemd.decisions.unit.file import runner_of
-from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of
 from dora_systemd.scope import Scope

@@ -8,7 +8,6 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NET, NETWORK, NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.needs.units import (
     CLOCK_WAITERS,
@@ -18,6 +17,7 @@ from dora_systemd.decisions.needs.units import (
     required_units,
 )
 from dora_systemd.decisions.needs.waiting import START, WAITS, format_wait
+from dora_systemd.decisions.needs.words import CLOCK, DATAFLOW, MOUNT, NET, NETWORK, NodeNeed
 from dora_systemd.decisions.properties.sandbox import Sandbox
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit, unit_name

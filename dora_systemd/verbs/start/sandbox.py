@@ -10,12 +10,12 @@ from dora_systemd.adapters.dora.preparation import PACKAGE
 from dora_systemd.adapters.host.files import absolute_path
 from dora_systemd.decisions.cell.launch import LaunchPlan, python_of
 from dora_systemd.decisions.cell.limits import has_cpus, limits_of
-from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import has_process_rights, rights_of
 from dora_systemd.decisions.cell.uv import uv_project
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.needs.units import device_entries, needs_can
+from dora_systemd.decisions.needs.words import needs_of
 from dora_systemd.decisions.notice.command import is_command, words_of
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
@@ -28,7 +28,7 @@ from dora_systemd.trust.paths import firm_part
 from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sight import Sight
 from dora_systemd.values import shown
-from dora_systemd.verbs.facts.nodes import named_places
+from dora_systemd.verbs.start.read import named_places
 from dora_systemd.verbs.start.where import Look
 
 _MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")

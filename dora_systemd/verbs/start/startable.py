@@ -17,9 +17,8 @@ from dora_systemd.decisions.descriptor.dataflow import (
     session_path,
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
-from dora_systemd.decisions.settings.credentials import CREDENTIALS, MAX_SIZE
 from dora_systemd.decisions.settings.resolve import Settings
-from dora_systemd.decisions.settings.sandbox import NETWORK
+from dora_systemd.decisions.settings.sandbox import CREDENTIALS, MOST_OF_CREDENTIALS, NETWORK
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import reached
@@ -136,7 +135,7 @@ def check_credentials(scope: Scope, files: Mapping[str, str]) -> None:
         except OSError as error:
             reason, hint = "there is no such file", "give the path of a file that has the secret"
             raise _refusal(name, file, reason, hint) from error
-        if total > MAX_SIZE:
+        if total > MOST_OF_CREDENTIALS:
             reason, hint = "it is too large", "all credentials together have at most 1 MiB"
             raise _refusal(name, file, reason, hint)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
-from dora_systemd.decisions.cell.needs import needs_of
+from dora_systemd.decisions.needs.words import needs_of
 from dora_systemd.decisions.properties.assignments import (
     NOTHING_NEWER,
     Newer,

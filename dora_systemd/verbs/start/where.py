@@ -18,8 +18,7 @@ from dora_systemd.adapters.host.files import decoded, read_text
 from dora_systemd.decisions.cell.environment import unit_environment
 from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.descriptor.expansion import called_variables
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, called_variables
 from dora_systemd.decisions.notice.command import words_of
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.machines import MACHINES

@@ -11,9 +11,16 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.bundles import store as stores
-from dora_systemd.adapters.bundles.archive import BLOCK, Archive, Section, Sink
 from dora_systemd.adapters.bundles.reader import opened
-from dora_systemd.adapters.bundles.store import BundleStore, locked, room
+from dora_systemd.adapters.bundles.store import (
+    BLOCK,
+    Archive,
+    BundleStore,
+    Section,
+    Sink,
+    locked,
+    room,
+)
 from dora_systemd.decisions.bundles.manifest import MANIFEST, Manifest, format_manifest
 from dora_systemd.decisions.views.rows import Bundles, format_bundles
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -16,8 +16,7 @@ from dora_systemd.adapters.releases.store import (
     remove_tree,
     store_root,
 )
-from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.manifest import Manifest, Stored
 from dora_systemd.decisions.releases.past import Known
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope

@@ -27,7 +27,7 @@ from dora_systemd.adapters.runner_socket.client import (
 )
 from dora_systemd.adapters.runner_socket.listener import serve
 from dora_systemd.adapters.runner_socket.relay import open_port
-from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator
+from dora_systemd.decisions.dora.protocol import Coordinator, parse_coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 TOKEN = "0123abc"

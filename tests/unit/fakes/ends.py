@@ -4,7 +4,7 @@ import asyncio
 import json
 from typing import Any, Self
 
-from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.adapters.runner_socket.listener import Ends
 from dora_systemd.decisions.machines.wire import Message, format_message
 
 

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from dora_systemd.adapters.journal.note import JOURNAL_SOCKET
-from dora_systemd.decisions.logs.fields import ExportReader
+from dora_systemd.decisions.logs.lines import ExportReader
 
 
 class Notes:

@@ -16,8 +16,7 @@ from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.dora.protocol import LogRecord, Params, Reply
 from dora_systemd.decisions.life.states import Record
-from dora_systemd.decisions.logs.fields import Value
-from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.decisions.logs.lines import Origin, Value
 from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.decisions.resources.usage import CpuSample, LineCount
 from dora_systemd.errors import DoraSystemdError

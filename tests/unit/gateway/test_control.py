@@ -39,9 +39,9 @@ from dora_systemd.decisions.logs.records import log_payload
 from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.jobs import find_file
 from dora_systemd.gateway.control.serve import HANDLERS, REFUSED, serve_control
 from dora_systemd.gateway.control.session import Talk
-from dora_systemd.gateway.control.start import find_file
 from dora_systemd.scope import Scope
 from tests.unit.fakes.ends import FakeWriter
 from tests.unit.fakes.socket import FakeSocket

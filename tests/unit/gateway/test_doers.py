@@ -16,9 +16,9 @@ from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.decisions.gateway.page_messages import PageMessage
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.forward import forward
+from dora_systemd.gateway.control.jobs import wanted_start
 from dora_systemd.gateway.control.serve import HANDLERS
 from dora_systemd.gateway.control.session import Talk
-from dora_systemd.gateway.control.start import wanted_start
 from dora_systemd.gateway.live.actions import Actions, act, read_graph
 from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope

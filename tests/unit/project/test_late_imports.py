@@ -104,9 +104,9 @@ LATE = {
         "decisions.views.outcome": {"decisions.views.objects"},
     },
     "most dataflows owe nothing, wait for nothing, never restarted, and run on one machine": {
+        "adapters.dora.probe": {"decisions.recorder.record"},
         "adapters.dora.preparation": {
             *("adapters.dora.probe", "decisions.machines.part", "decisions.settings.runner"),
-            "adapters.dora.recorder",
         },
         "runner.main": {
             "runner.cell.notices",
@@ -121,7 +121,7 @@ LATE = {
     "few stops have an order, and few nodes start containers": {
         "runner.cell.machine_role": {"runner.cell.node_stops"},
         "runner.machines.head": {"runner.machines.order"},
-        "runner.nodes.clients": {"adapters.host.clients"},
+        "runner.nodes.groups": {"adapters.host.clients"},
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},

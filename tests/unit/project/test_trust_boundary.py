@@ -56,17 +56,17 @@ _TABLE = {
         verbs.start.where
     """,
     KERNEL: """
-        adapters.cgroup.groups adapters.host.clients adapters.host.interrupts
-        adapters.host.process_times
+        adapters.cgroup.groups adapters.host.clients
+        adapters.host.rivals
         adapters.host.process_table adapters.host.real_time adapters.host.rights
-        runner.cell.restarts trust.socket_table verbs.destroy
+        runner.cell.restarts verbs.destroy
         link.relay verbs.facts.host verbs.facts.lives verbs.facts.stack verbs.start.programs
         verbs.start.sandbox
     """,
     ROOTS: """
         adapters.bus.connection adapters.host.unit_files
         adapters.host.guard
-        adapters.bundles.archive adapters.bundles.store
+        adapters.bundles.store
         adapters.releases.draft adapters.releases.transfer
         adapters.releases.store verbs.releases.source verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
@@ -87,7 +87,7 @@ _TABLE = {
         adapters.host.presence runner.requests runner.needs runner.nodes.launcher_gates
         runner.cell.engine runner.cell.notices runner.cell.pump runner.machines.head
         runner.machines.roster runner.main runner.nodes.nodes
-        runner.recorder.keep runner.recorder.record runner.recorder.ring_file
+        runner.recorder.keep runner.recorder.record
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
     OTHERWISE: """

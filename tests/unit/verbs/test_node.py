@@ -13,7 +13,7 @@ import pytest
 
 from dora_systemd.decisions.cell.options import SettingText
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
-from dora_systemd.decisions.dora.coordinator import Coordinator
+from dora_systemd.decisions.dora.protocol import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs import node

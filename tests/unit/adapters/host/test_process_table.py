@@ -13,7 +13,7 @@ from dora_systemd.adapters.host.process_table import (
     read_processes,
     socket_owners,
 )
-from dora_systemd.trust.socket_table import listening_sockets
+from dora_systemd.trust.sockets import listening_sockets
 
 
 def test_ourselves() -> None:

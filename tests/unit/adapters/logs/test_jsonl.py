@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.adapters.logs.jsonl import POLL_SECONDS, JsonlTail, resume_tail
-from dora_systemd.decisions.logs.fields import Value
+from dora_systemd.decisions.logs.lines import Value
 
 
 class Dora:

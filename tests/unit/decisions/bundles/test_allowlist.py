@@ -4,6 +4,8 @@ import json
 import re
 
 from dora_systemd.decisions.bundles.allowlist import (
+    LIVES,
+    export_entry,
     is_kept_field,
     is_kill_of,
     kept_findings,
@@ -12,10 +14,10 @@ from dora_systemd.decisions.bundles.allowlist import (
     kept_report,
     kept_row,
     kept_status,
+    of_lives,
 )
-from dora_systemd.decisions.bundles.export import LIVES, export_entry, of_lives
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
-from dora_systemd.decisions.logs.fields import ExportReader
+from dora_systemd.decisions.logs.lines import ExportReader
 from dora_systemd.decisions.resources.usage import LineCount
 from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.findings import Finding, State

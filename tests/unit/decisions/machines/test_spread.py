@@ -8,12 +8,12 @@ import pytest
 from dora_systemd.decisions.cell.launch import watchdogs_of
 from dora_systemd.decisions.cell.limits import limits_of
 from dora_systemd.decisions.cell.machines import Placed
-from dora_systemd.decisions.cell.needs import needs_of
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.decisions.cell.options import format_runner_argv as runner_argv
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.machines.spread import spread
+from dora_systemd.decisions.needs.words import needs_of
 from dora_systemd.decisions.settings.resolve import resolve_settings, with_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 

@@ -2,7 +2,6 @@
 
 import pytest
 
-from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NODE_STATES, NodeStatus
 from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
 from dora_systemd.decisions.needs.units import (
@@ -11,6 +10,7 @@ from dora_systemd.decisions.needs.units import (
     lone_devices,
     needs_can,
 )
+from dora_systemd.decisions.needs.words import NodeNeed
 
 GONE = "/dev/video0 (not there)"
 OPEN = frozenset({"camera"})

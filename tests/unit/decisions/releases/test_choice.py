@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import (
     Manifest,
+    Stored,
     format_manifest,
     is_revision,
     new_id,

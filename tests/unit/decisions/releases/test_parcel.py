@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.decisions.releases.entries import Stored
+from dora_systemd.decisions.releases.manifest import Stored
 from dora_systemd.decisions.releases.parcel import (
     Parcel,
     format_parcel,

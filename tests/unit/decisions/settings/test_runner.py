@@ -21,8 +21,7 @@ from dora_systemd.decisions.cell.owes import owes_of, policies_of
 from dora_systemd.decisions.cell.rights import NodeRights, rights_of
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.descriptor.nodes import parse_node
-from dora_systemd.decisions.machines.entry import Machine
-from dora_systemd.decisions.machines.member import member_of, on_head
+from dora_systemd.decisions.machines.member import Machine, member_of, on_head
 from dora_systemd.decisions.machines.part import own_options
 from dora_systemd.decisions.remote.hosts import parse_host
 from dora_systemd.decisions.settings.resolve import resolve_settings, with_settings

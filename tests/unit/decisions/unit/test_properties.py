@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.environment import unit_environment
 from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
-from dora_systemd.decisions.properties.kinds import Property
-from dora_systemd.decisions.properties.syntax import split_words
+from dora_systemd.decisions.properties.kinds import Property, split_words
 from dora_systemd.decisions.settings.kinds import TEXT, Kind, Setting
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.settings.table import SETTINGS

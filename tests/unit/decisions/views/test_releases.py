@@ -1,7 +1,6 @@
 """The table of releases, and where else a release is shown."""
 
-from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.manifest import Manifest, Stored
 from dora_systemd.decisions.views.dataflows import format_dataflows
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.objects import dataflow_object

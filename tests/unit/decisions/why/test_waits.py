@@ -2,8 +2,7 @@
 
 import pytest
 
-from dora_systemd.decisions.resources.interrupts import Shared
-from dora_systemd.decisions.resources.rivals import Rival
+from dora_systemd.decisions.resources.rivals import Rival, Shared
 from dora_systemd.decisions.why.waits import CpuWait, format_cpu_waits, wait_remedies
 from dora_systemd.values import SECOND
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.adapters.runner_socket.listener import Ends
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions

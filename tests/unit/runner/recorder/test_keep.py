@@ -14,8 +14,15 @@ from dora_systemd.decisions.cell.options import SettingText
 from dora_systemd.decisions.recorder.record import RECORDER, ROOM, Record
 from dora_systemd.decisions.recorder.ring import ALIGN, parse_header
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.recorder.keep import Recorder, Rings, keep_recorder
-from dora_systemd.runner.recorder.ring_file import RingSocket, fitted_ring, free_ring, header_of
+from dora_systemd.runner.recorder.keep import (
+    Recorder,
+    Rings,
+    RingSocket,
+    fitted_ring,
+    free_ring,
+    header_of,
+    keep_recorder,
+)
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.swap import Swapper
 from tests.unit.fakes.loop import live

@@ -10,7 +10,7 @@ from pathlib import Path
 import dora_systemd
 from dora_systemd.decisions.recorder.reading import Reading, Recorded
 from dora_systemd.decisions.recorder.record import Record
-from dora_systemd.runner.recorder.ring_file import RingSocket, fitted_ring, header_of
+from dora_systemd.runner.recorder.keep import RingSocket, fitted_ring, header_of
 
 PACKAGE = Path(dora_systemd.__file__).parent
 SCRIPT = PACKAGE / "runner" / "recorder" / "record.py"

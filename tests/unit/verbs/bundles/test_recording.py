@@ -10,8 +10,8 @@ import pytest
 
 from dora_systemd.decisions.recorder.record import Record
 from dora_systemd.decisions.recorder.writer import Writer
+from dora_systemd.runner.recorder.keep import fitted_ring, header_of
 from dora_systemd.runner.recorder.record import FileStore
-from dora_systemd.runner.recorder.ring_file import fitted_ring, header_of
 from dora_systemd.scope import Scope
 from dora_systemd.trust.rings import RingFile, find_ring
 from dora_systemd.verbs.bundles import recording

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.host.interrupts import Interrupts
+from dora_systemd.adapters.host.rivals import Interrupts
 from dora_systemd.decisions.resources.rivals import Rival
 from dora_systemd.decisions.why.waits import MINUTE, CpuWait
 from dora_systemd.scope import Scope

@@ -10,8 +10,7 @@ import pytest
 
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store
-from dora_systemd.decisions.releases.entries import Found, Stored
-from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.manifest import Found, Manifest, Stored
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.project import Project, opened_project
 from dora_systemd.verbs.releases.files import copy_files, digests, find_files

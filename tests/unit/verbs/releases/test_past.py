@@ -16,8 +16,8 @@ from dora_systemd.decisions.views.releases import (
     format_releases,
     release_object,
 )
-from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.decisions.why.report import format_report
+from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.deploy import prune

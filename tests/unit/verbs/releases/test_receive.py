@@ -13,8 +13,7 @@ import pytest
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store
 from dora_systemd.adapters.releases.transfer import Stream, incoming, leftovers, spooled
-from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.manifest import Manifest, Stored
 from dora_systemd.decisions.releases.parcel import Parcel, format_parcel
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope

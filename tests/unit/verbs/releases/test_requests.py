@@ -10,11 +10,10 @@ import pytest
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.adapters.releases.transfer import incoming
-from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.manifest import Manifest, Stored
 from dora_systemd.decisions.releases.past import REPLACED, Switch
 from dora_systemd.decisions.views.findings import Finding, State
-from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.deploy import Deployed

@@ -11,7 +11,7 @@ from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.decisions.releases.progress import Step, starting, stopping
-from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.lives import now_boot

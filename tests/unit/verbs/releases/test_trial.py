@@ -13,7 +13,7 @@ from dora_systemd.adapters.releases.store import Store, locked, store_root
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
-from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope

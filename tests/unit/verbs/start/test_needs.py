@@ -2,7 +2,7 @@
 
 import pytest
 
-from dora_systemd.decisions.cell.needs import NodeNeed
+from dora_systemd.decisions.needs.words import NodeNeed
 from dora_systemd.decisions.properties.sandbox import Sandbox
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import need_failure

@@ -7,9 +7,8 @@ import pytest
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.on_failure import check_units, find_command
-from tests.unit.decisions.cell.test_programs import elf
 from tests.unit.fakes.manager import FakeManager, options
-from tests.unit.verbs.start.test_programs import Disk
+from tests.unit.verbs.start.test_programs import Disk, elf
 
 DISK = Disk(files={"/usr/bin/tell": elf(62), "/srv/tell": elf(62)})
 SCOPE = Scope(is_user=False, uid=0)

@@ -20,11 +20,16 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import Place, reached
 from dora_systemd.trust.sight import LentSight, Sight, sight_of
-from dora_systemd.verbs.facts.nodes import named_places
 from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.plan import Plan, make_plan
-from dora_systemd.verbs.start.read import SYSTEM_FILE, config_files, read_files, read_settings_file
+from dora_systemd.verbs.start.read import (
+    SYSTEM_FILE,
+    config_files,
+    named_places,
+    read_files,
+    read_settings_file,
+)
 from dora_systemd.verbs.start.request import StartRequest, request_name
 from dora_systemd.verbs.start.settings import check_config, require_modest, settings_of
 from dora_systemd.verbs.start.where import account_of, choose_user

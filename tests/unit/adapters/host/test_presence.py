@@ -2,8 +2,7 @@
 
 import select
 
-from dora_systemd.adapters.host.links import LinkChanges, look_at_link
-from dora_systemd.adapters.host.presence import Presence
+from dora_systemd.adapters.host.presence import LinkChanges, Presence, look_at_link
 
 
 def test_loopback_is_there_and_stays_the_same() -> None:

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.recorder.mcap import MOST_CHANNELS, McapWriter
+from dora_systemd.decisions.recorder.mcap import MOST_CHANNELS, McapWriter, Written, write_recording
 from dora_systemd.decisions.recorder.reading import Reading
-from dora_systemd.decisions.recorder.recording import Written, write_recording
 from dora_systemd.decisions.recorder.writer import Message
 from tests.unit.checkout import CHECKOUT
 from tests.unit.fakes.recorder.mcap import File

@@ -2,15 +2,15 @@
 
 import pytest
 
-from dora_systemd.decisions.cell.needs import (
+from dora_systemd.decisions.cell.options import format_runner_argv, parse_runner_argv
+from dora_systemd.decisions.needs.units import needs_properties
+from dora_systemd.decisions.needs.words import (
     NodeNeed,
     check_needs,
     needs_of,
     parse_needs,
     parse_node_needs,
 )
-from dora_systemd.decisions.cell.options import format_runner_argv, parse_runner_argv
-from dora_systemd.decisions.needs.units import needs_properties
 from dora_systemd.decisions.settings.resolve import resolve_settings, with_settings
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.fakes.manager import options as runner_options

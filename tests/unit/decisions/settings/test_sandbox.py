@@ -10,8 +10,12 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.environment import node_environment, parse_assignment
 from dora_systemd.decisions.properties.assignments import parse_property
-from dora_systemd.decisions.settings.credentials import CREDENTIALS, MAX_SIZE, credential_properties
 from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.settings.sandbox import (
+    CREDENTIALS,
+    MOST_OF_CREDENTIALS,
+    credential_properties,
+)
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -89,7 +93,7 @@ def test_a_unit_has_the_path_and_not_the_secret(tmp_path: Path) -> None:
 
 def test_files_that_are_refused(tmp_path: Path) -> None:
     good = tmp_path / "good"
-    good.write_bytes(b"x" * MAX_SIZE)
+    good.write_bytes(b"x" * MOST_OF_CREDENTIALS)
     check_credentials(USER, {"good": str(good)})
     os.mkfifo(tmp_path / "fifo")
     with socket.socket(socket.AF_UNIX) as one:

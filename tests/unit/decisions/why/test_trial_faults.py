@@ -2,8 +2,8 @@
 
 import pytest
 
-from dora_systemd.decisions.why.faults import Fault, find_fault, is_finished
 from dora_systemd.decisions.why.lives import Happening
+from dora_systemd.decisions.why.trial_faults import Fault, find_fault, is_finished
 
 CRASH = Happening("node-crashed", 20, "a", "Node a crashed", "new", details={"exit": "exit code 1"})
 
