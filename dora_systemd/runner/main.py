@@ -12,6 +12,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Coroutine
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,19 +24,16 @@ from dora_systemd.adapters.host import fd_store, notify
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import serve
-from dora_systemd.decisions.cell.launch import kinds, watchdogs_of
+from dora_systemd.decisions.cell.launch import watchdogs_of
 from dora_systemd.decisions.cell.limits import limits_of
 from dora_systemd.decisions.cell.line_rates import rates_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import restart_of
-from dora_systemd.decisions.cell.stops import named_stops
-from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.refusal import refusal_exit
 from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import Cell
-from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
@@ -49,8 +47,9 @@ from dora_systemd.runner.cell.begin import (
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.clock import Keepalive, StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
+from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, say, words
-from dora_systemd.runner.cell.machine_role import Alone
+from dora_systemd.runner.cell.machine_role import Alone, first_cell
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.cell.refusal import read_options, tell_failure
 from dora_systemd.runner.cell.restarts import (
@@ -250,23 +249,15 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         prepared = reloader.current or prepare_first(runs, options)
         role.prepare(runs.paths, prepared, runs.check)
         runs.nodes.prepare(role.here(prepared.dataflow), rates_of(own), limits_of(own))
-        table = initial_nodes(
-            kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
-        )
-        stops = named_stops(options.by_node("stop"))
-        cell = Cell(
-            *(options.grace, started_us, table),
-            downstream=downstream_of(prepared.dataflow),
+        cell = replace(
+            first_cell(options, prepared, started_us),
             is_again=is_again,
             is_trial=reloader.before is not None,
             notice=reloader.notice,
-            is_attached=options.attached,
-            stops=stops,
-            stop_limit=options.of_dataflow("stop_limit") if stops or options.machine else 0,
         )
         pump = Pump(role.cell(cell), runs.this_life, runs.paths, runs.nodes, runs.pipes)
         dialogue = role.dialogue(options, pump, dora, runs.nodes, runs.pipes)
-        if stops or options.machine:
+        if cell.stops or options.machine:
             pump.on_node = role.node_stops(pump, dora, runs.nodes, dialogue).perform
         variables = daemon_variables(own, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
@@ -283,20 +274,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
         runs.nodes.gates.make({*own.by_node("needs")})
-        if own.has("needs"):
-            from dora_systemd.runner.needs import wait_for_needs
-
-            wait_for_needs(run, own, reloader.definition, dialogue.spawn)
-        dialogue.spawn("end with the last node", end_held(run))
-        dialogue.spawn("report that it has started", tell_started(run, reloader.has_started))
-        if options.has("owes"):
-            from dora_systemd.runner.owes.watch import watch_owes
-
-            dialogue.spawn("watch what nodes owe", watch_owes(run, prepared, dora, dialogue))
-        if runs.rings is not None:
-            from dora_systemd.runner.recorder.keep import keep_recorder
-
-            dialogue.spawn("record", keep_recorder(run, prepared, dora, runs.rings))
+        spawn_tasks(runs, run, prepared, dora, dialogue)
         runs.beside.attach(pump.push)
         try:
             await pump.end
@@ -310,6 +288,26 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         return pump.cell
     finally:
         dora.kill()
+
+
+def spawn_tasks(runs: Runs, run: Run, prepared: Prepared, dora: Engine, dialogue: Dialogue) -> None:
+    """Start the other tasks of a run, as far as its options need them."""
+    options, reloader = runs.reloader.options, runs.reloader
+    own = runs.role.own(options)
+    if own.has("needs"):
+        from dora_systemd.runner.needs import wait_for_needs
+
+        wait_for_needs(run, own, reloader.definition, dialogue.spawn)
+    dialogue.spawn("end with the last node", end_held(run))
+    dialogue.spawn("report that it has started", tell_started(run, reloader.has_started))
+    if options.has("owes"):
+        from dora_systemd.runner.owes.watch import watch_owes
+
+        dialogue.spawn("watch what nodes owe", watch_owes(run, prepared, dora, dialogue))
+    if runs.rings is not None:
+        from dora_systemd.runner.recorder.keep import keep_recorder
+
+        dialogue.spawn("record", keep_recorder(run, prepared, dora, runs.rings))
 
 
 def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:

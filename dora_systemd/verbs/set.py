@@ -6,7 +6,7 @@ of a unit file when the file is removed.
 """
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -71,12 +71,7 @@ def set_limits(
     unit = manager.read(cell.unit, _PROPERTIES)
     values = {key: settings.values[key] for key in BY_KEY}
     warnings = (*size_warnings(values, nodes, read_machine()), *_placed_warnings(cell, rates))
-    if unit["ControlGroup"]:
-        group = cgroup.group_path(unit["ControlGroup"])
-        kept = cgroup.read_numbers(group / "memory.stat").get("shmem", 0)
-        if not is_forced:
-            check_use(values, nodes, cgroup.read_usage(group).memory, _held(group))
-        check_kept(values["memory_limit"], kept)
+    _check_memory(unit, values, nodes, is_forced)
     # systemd stores drop-ins of a transient unit in /run in any case.
     is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
     # The kernel is the most likely to refuse, then systemd. `undo` reverts the steps before that.
@@ -92,6 +87,19 @@ def set_limits(
             manager.reload()
         undo.pop_all()
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
+
+
+def _check_memory(
+    unit: Mapping[str, Any], values: Mapping[str, Any], nodes: Sequence[NodeLimits], is_forced: bool
+) -> None:
+    """Raise DoraSystemdError for a memory limit below what is used, or below what is kept."""
+    if not unit["ControlGroup"]:
+        return
+    group = cgroup.group_path(unit["ControlGroup"])
+    kept = cgroup.read_numbers(group / "memory.stat").get("shmem", 0)
+    if not is_forced:
+        check_use(values, nodes, cgroup.read_usage(group).memory, _held(group))
+    check_kept(values["memory_limit"], kept)
 
 
 def _limits(settings: Settings) -> tuple[NodeLimits, ...]:

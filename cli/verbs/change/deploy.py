@@ -26,6 +26,7 @@ from dora_systemd.cli.progress import open_progress, quiet_option
 from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, compare, deploy
 from dora_systemd.verbs.releases.receive import compare_sent, receive
 from dora_systemd.verbs.start.logins import ensure_linger, logout_note
@@ -107,16 +108,18 @@ def command(
     start = StartRequest(dataflow, name, flags, os.environ)
     bus = Bus(scope)
     if dry_run:
-        found = (
-            compare_sent(bus, scope, Stream(_INPUT))
-            if from_stdin
-            else compare(bus, scope, start, not no_build)
-        )
-        return ExitCode.OK if is_quiet else _print_changes(*found)
+        return _print_changes(bus, scope, start, not no_build, from_stdin, is_quiet)
     if not build_timeout:
         raise DoraSystemdError("cannot build in no time", "give a --build-timeout", ExitCode.USAGE)
     how, build_timeout = if_inhibited(force, wait), 0 if no_build else build_timeout
     request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout, allow_waiting)
+    done = _deploy(bus, scope, request, from_stdin, is_quiet)
+    return print_outcomes([] if is_quiet else [deployed_outcome(done, "deployed")])
+
+
+def _deploy(
+    bus: Bus, scope: Scope, request: DeployRequest, from_stdin: bool, is_quiet: bool
+) -> Deployed:
     note = logout_note(scope)
     with open_progress(is_quiet) as progress:
         warn = progress.warn
@@ -125,7 +128,7 @@ def command(
         else:
             done = deploy(bus, scope, request, progress, warn)
     progress.warn(ensure_linger(scope) if request.want_boot else note)
-    return print_outcomes([] if is_quiet else [deployed_outcome(done, "deployed")])
+    return done
 
 
 def _answer(line: str) -> None:
@@ -148,7 +151,15 @@ def deployed_outcome(done: Deployed, how: str) -> Outcome:
     return Outcome(done, "\n".join([*lines, f"Unit: {done.unit}"]), details=details)
 
 
-def _print_changes(last: str, changes: dict[str, list[str]]) -> int:
+def _print_changes(
+    bus: Bus, scope: Scope, start: StartRequest, want_build: bool, from_stdin: bool, is_quiet: bool
+) -> int:
+    if from_stdin:
+        last, changes = compare_sent(bus, scope, Stream(_INPUT))
+    else:
+        last, changes = compare(bus, scope, start, want_build)
+    if is_quiet:
+        return ExitCode.OK
     if wants_json():
         print_json({"release": last or None, **changes})
         return ExitCode.OK

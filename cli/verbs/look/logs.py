@@ -19,6 +19,7 @@ from dora_systemd.decisions.logs.records import parse_filter
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import LINK_PREFIX
+from dora_systemd.scope import Scope
 from dora_systemd.trust.programs import check_program
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.recorded import find_query, find_soon
@@ -174,14 +175,9 @@ def command(
       journalctl -t robot/camera              the same, with systemd's own tool
     """
     scope = current_scope()
-    places = unit_places(scope, os.environ)
-    if machine or (len(selectors) == 1 and has_unit(places, LINK_PREFIX)):
-        # Imported late: most dataflows run on one machine.
-        from dora_systemd.cli.remote.machines import print_machines
-
-        status = print_machines(scope, click.get_current_context())
-        if status is not None:
-            return status
+    is_shared = len(selectors) == 1 and has_unit(unit_places(scope, os.environ), LINK_PREFIX)
+    if (machine or is_shared) and (status := _print_machines(scope)) is not None:
+        return status
     options.pop("all_nodes")
     options["level"] = parse_level(options["level"]) if options["level"] else ""
     tail = last_count(counts)
@@ -189,9 +185,7 @@ def command(
     journal = JournalReader()
     wanted = LogQuery(scope, tail=tail, levels=parse_filter(log_filter), **options)
     query = find_soon(
-        lambda: find_query(JournalReader(), wanted, selectors, nodes, run),
-        scope,
-        selectors,
+        lambda: find_query(JournalReader(), wanted, selectors, nodes, run), scope, selectors
     )
     lines = _lines(journal, query)
     if until_end:
@@ -205,6 +199,14 @@ def command(
         return _exit_status(_print(query, lines))
     print_paged(read_logs(query, lines, wants_colors(sys.stdout)))
     return ExitCode.OK
+
+
+def _print_machines(scope: Scope) -> int | None:
+    """Print the lines of several machines; None if the dataflow runs on one."""
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.cli.remote.machines import print_machines
+
+    return print_machines(scope, click.get_current_context())
 
 
 def last_count(values: Sequence[str]) -> str:

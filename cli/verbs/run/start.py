@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 
@@ -44,6 +44,15 @@ _USUAL = (
     *("--name", "--enable", "--attach", "--dry-run", "--env", "--venv", "--memory-limit"),
     *("--cpu-limit", "--restart-policy", "--device", "--writable", "--hot-reload"),
 )
+
+
+class Wanted(NamedTuple):
+    """What a start does besides."""
+
+    boot: bool  # enable it
+    logs: bool  # print its logs until it ends
+    wait: bool  # until all nodes are ready
+    push: bool  # first copy its files to all machines
 
 
 @click.command("start", cls=SettingsCommand, usual=_USUAL)
@@ -109,30 +118,38 @@ def command(
             return _start_known(bus, scope, known, not no_wait)
         request = known.request(request)
     if dry_run:
-        connect = cache(partial(Bus, scope))
-        target = boot_target(connect(), scope) if want_boot else None
-        plan = make_plan(scope, request)
-        check_plan(connect, plan)
-        write_exactly(format_plan(plan, connect, target))
-        return ExitCode.OK
+        return _print_unit(scope, request, want_boot)
+    return _start(scope, request, Wanted(want_boot, want_logs, not no_wait, want_push))
+
+
+def _print_unit(scope: Scope, request: StartRequest, want_boot: bool) -> ExitCode:
+    connect = cache(partial(Bus, scope))
+    target = boot_target(connect(), scope) if want_boot else None
+    plan = make_plan(scope, request)
+    check_plan(connect, plan)
+    write_exactly(format_plan(plan, connect, target))
+    return ExitCode.OK
+
+
+def _start(scope: Scope, request: StartRequest, want: Wanted) -> int:
     bus = Bus(scope)
-    if want_push:
+    if want.push:
         _push(bus, scope, request)
-    claimed = claim(bus, scope, request, "doractl start", want_boot)
+    claimed = claim(bus, scope, request, "doractl start", want.boot)
     print_warnings(claimed.warnings)
-    print_warnings([ensure_linger(scope) if want_boot else ""])
+    print_warnings([ensure_linger(scope) if want.boot else ""])
     logins = () if has_run_here(scope) else start_notes(claimed.plan)
-    notes = [*claimed.plan.notes, *logins, "" if want_boot else logout_note(scope)]
-    if want_logs:
+    notes = [*claimed.plan.notes, *logins, "" if want.boot else logout_note(scope)]
+    if want.logs:
         return _attach(bus, claimed, notes)
     options = claimed.plan.options
     with _last_words(bus, scope, options.uuid), StageLine(sys.stderr) as stage:
-        how = (claimed.properties, stage, not no_wait, claimed.links)
+        how = (claimed.properties, stage, want.wait, claimed.links)
         started = start_unit(bus, scope, options, *how)
     status = _print_started(started, options.dataflow, watched_patterns(claimed.plan))
     # Only after the start: a refusal must be one line and a hint.
     print_warnings([*notes, *waiting_notes(bus, options)])
-    print_warnings(held_notes(bus, options.name) if no_wait else ())
+    print_warnings(() if want.wait else held_notes(bus, options.name))
     return status
 
 

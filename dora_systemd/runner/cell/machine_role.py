@@ -10,10 +10,13 @@ from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import Session
+from dora_systemd.decisions.cell.launch import kinds
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.cell.stops import named_stops
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, downstream_of
 from dora_systemd.decisions.life.events import NodeAsked
 from dora_systemd.decisions.life.states import Cell
+from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
@@ -27,6 +30,19 @@ if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
     from dora_systemd.adapters.runner_socket.door import Door
     from dora_systemd.runner.cell.node_stops import NodeStops
+
+
+def first_cell(options: RunnerOptions, prepared: Prepared, started_us: int) -> Cell:
+    """The cell of a run before its first event. started_us: CLOCK_REALTIME."""
+    nodes = kinds(prepared.dataflow, prepared.plan)
+    stops = named_stops(options.by_node("stop"))
+    return Cell(
+        *(options.grace, started_us, initial_nodes(nodes, prepared.descriptor, started_us)),
+        downstream=downstream_of(prepared.dataflow),
+        is_attached=options.attached,
+        stops=stops,
+        stop_limit=options.of_dataflow("stop_limit") if stops or options.machine else 0,
+    )
 
 
 class Alone:
