@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from dora_systemd.decisions.cell.exits import KILLED, parse_exit
 from dora_systemd.decisions.cell.owes import STARVED
-from dora_systemd.decisions.logs.journal_events import END_EVENTS, NODE_END_EVENTS
+from dora_systemd.decisions.logs.journal_events import END_EVENTS, NODE_END_EVENTS, NODE_FAILURES
 from dora_systemd.decisions.resources.oom import Owner
 from dora_systemd.decisions.resources.pressure import CPU, FULL, MEMORY, STALLED
 from dora_systemd.decisions.why.lives import Happening, Life, parse_number
@@ -13,7 +13,6 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_node_id
 from dora_systemd.values import INFINITY, SECOND, parse_duration
 
-FAILURES = ("node-crashed", "node-ended", "node-oom")
 EVENTS = (
     *("dataflow-starting", "dataflow-started", "dataflow-stopping", *END_EVENTS),
     *(*NODE_END_EVENTS, "node-ready", "node-restarted", "node-stop-late"),
@@ -126,7 +125,7 @@ def _lifetimes(life: Life) -> _Found:
     for one in life.happenings:
         if one.name == "node-ready":
             ready[one.node] = one.at_us
-        elif one.name in (*FAILURES, "node-restarted"):
+        elif one.name in (*NODE_FAILURES, "node-restarted"):
             kind = RESTART if one.name == "node-restarted" else CRASH
             ran = max(one.at_us - ready[one.node], 0) if one.node in ready else 0
             yield one.node, kind, ran, one.at_us

@@ -16,6 +16,7 @@ from dora_systemd.decisions.cell.status import (
 from dora_systemd.decisions.descriptor.dataflow import Downstream
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Record
+from dora_systemd.decisions.logs.journal_events import NODE_FAILURES
 from dora_systemd.values import SECOND, format_duration
 
 NodeTable = Mapping[str, NodeStatus]
@@ -24,8 +25,6 @@ Change = tuple[NodeTable, Record | None]
 
 WITH_PROCESS = frozenset({"starting", "ready", "running"})
 _MAYBE = ("reloading", "waiting", "stopped")
-FAILURES = ("node-crashed", "node-ended", "node-oom")
-"""The events of a process that has failed."""
 
 
 def has_process(nodes: NodeTable) -> bool:
@@ -315,7 +314,7 @@ def _exited_as_told(nodes: NodeTable, event: life.NodeExited, old: NodeStatus) -
 def with_downstream(record: Record, downstream: Downstream) -> Record:
     """Add the nodes downstream of a failed node to its life event."""
     fed = downstream.get(record.node)
-    if record.event not in FAILURES or not fed:
+    if record.event not in NODE_FAILURES or not fed:
         return record
     return replace(record, details={**record.details, "downstream": " ".join(fed)})
 

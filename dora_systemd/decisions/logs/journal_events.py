@@ -176,9 +176,11 @@ EVENTS = {
 
 STARTING, STARTED, STOPPING = "dataflow-starting", "dataflow-started", "dataflow-stopping"
 # Each life of a dataflow ends with one of these, unless the runner was killed.
-END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
+CLEAN_ENDS = ("dataflow-finished", "dataflow-stopped")
+END_EVENTS = (*CLEAN_ENDS, "dataflow-failed")
 # Each life of a node's process ends with one of these.
-NODE_END_EVENTS = ("node-exited", "node-crashed", "node-ended", "node-oom")
+NODE_FAILURES = ("node-crashed", "node-ended", "node-oom")
+NODE_END_EVENTS = ("node-exited", *NODE_FAILURES)
 
 START_ASKED = "start-asked"
 ROLLED_BACK = "release-rolled-back"

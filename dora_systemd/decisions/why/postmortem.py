@@ -12,7 +12,7 @@ from dora_systemd.decisions.cell.owes import STARVED
 from dora_systemd.decisions.cell.status import RESTART
 from dora_systemd.decisions.life.causes import ESSENTIAL, NO_END, UNIT_RESULTS, Cause, result_words
 from dora_systemd.decisions.life.refusal import setup_failure
-from dora_systemd.decisions.logs.journal_events import NODE_END_EVENTS
+from dora_systemd.decisions.logs.journal_events import NODE_END_EVENTS, NODE_FAILURES
 from dora_systemd.decisions.reload.changes import How
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.watchdog.judge import by_watchdog
@@ -20,7 +20,6 @@ from dora_systemd.decisions.why.lives import Happening, Life, ended_nodes, with_
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 from dora_systemd.values import SECOND
 
-_CRASHES = ("node-crashed", "node-ended", "node-oom")
 _LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST, Cause.MACHINE_LOST)
 """Causes with the same names as their events."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
@@ -150,7 +149,7 @@ def _gathering(chain: Sequence[Life]) -> Verdict:
 
 def final_crashes(life: Life) -> list[Happening]:
     """The last crash of each node, earliest first: the others may be consequences of it."""
-    last = {one.node: one for one in life.all(*_CRASHES)}
+    last = {one.node: one for one in life.all(*NODE_FAILURES)}
     return sorted(last.values(), key=lambda one: one.at_us)
 
 
@@ -311,7 +310,9 @@ def _killed_at_stop(life: Life) -> str:
 
 
 def _starved(found: Verdict, life: Life) -> tuple[str, ...]:
-    crash = next((one for one in reversed(life.all(*_CRASHES)) if one.node == found.node), None)
+    crash = next(
+        (one for one in reversed(life.all(*NODE_FAILURES)) if one.node == found.node), None
+    )
     return tuple(crash.detail("downstream").split()) if crash and found.node else ()
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from dora_systemd.decisions.logs.journal_events import EVENTS
+from dora_systemd.decisions.logs.journal_events import CLEAN_ENDS, EVENTS
 from dora_systemd.decisions.why.lives import Happening
 
 WAITING = "node-waiting"
@@ -12,8 +12,7 @@ FAULTS = (
     *(WAITING, "node-restarted", "dataflow-oom"),
     *("daemon-lost", "coordinator-lost", "dataflow-failed"),
 )
-ENDS = ("dataflow-finished", "dataflow-stopped")
-FAULT_IDS = tuple(EVENTS[name].message_id for name in (*FAULTS, *ENDS))
+FAULT_IDS = tuple(EVENTS[name].message_id for name in (*FAULTS, *CLEAN_ENDS))
 """The MESSAGE_IDs that a trial searches."""
 _HOW = {"node-watchdog": "hung, ", WAITING: "waits for "}
 """The text that `why` and `list` show before the reason, instead of the name of the event."""
@@ -54,7 +53,7 @@ def is_finished(happenings: Iterable[Happening]) -> bool:
 
     happenings: newest first.
     """
-    last = next((one for one in happenings if one.name in ENDS), None)
+    last = next((one for one in happenings if one.name in CLEAN_ENDS), None)
     return last is not None and last.name == "dataflow-finished"
 
 

@@ -13,7 +13,7 @@ from dora_systemd.adapters.journal.reader import (
     later_failures,
 )
 from dora_systemd.decisions.life.causes import NO_END
-from dora_systemd.decisions.logs.journal_events import FORGOTTEN
+from dora_systemd.decisions.logs.journal_events import CLEAN_ENDS, FORGOTTEN
 from dora_systemd.decisions.logs.query import request_matches
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -23,7 +23,6 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.reason import failure_reason
 
 _WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
-_CLEAN = ("dataflow-finished", "dataflow-stopped")
 _MOST_NAMES = 100
 _TIMES = ("InactiveEnterTimestamp", "InactiveExitTimestamp")
 
@@ -133,7 +132,7 @@ def _with_later_failures(scope: Scope, events: list[LastEvent]) -> list[LastEven
     Such as when systemd cannot set up the sandbox for the second half of a restart. For dataflows
     of a user no record contains which dataflow has failed.
     """
-    clean = [event for event in events if event.event in _CLEAN]
+    clean = [event for event in events if event.event in CLEAN_ENDS]
     if scope.is_user or not clean:
         return events
     failed: dict[str, int] = {}

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.advice.evidence import FAILURES, Recorded, collect
+from dora_systemd.decisions.advice.evidence import Recorded, collect
 from dora_systemd.decisions.advice.report import AdviceReport, format_report, report_object
 from dora_systemd.decisions.advice.rules import Advice, Current, advise, too_little
 from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.cell.stops import NodeStop
+from dora_systemd.decisions.logs.journal_events import NODE_FAILURES
 from dora_systemd.decisions.views.formats import zoned_time
 from dora_systemd.decisions.why.lives import Happening, Life
 from dora_systemd.values import INFINITY, SECOND, parse_cpu, parse_duration, parse_size
@@ -110,7 +111,7 @@ def test_what_a_limit_hides_is_found_step_by_step(truth: Truth, share: float, se
     ):
         assert need <= have <= 1.6 * need
     last = lives_of(truth, limits, 1, len(lives), seed)[0]
-    assert not last.all(*FAILURES, "cpu-throttled", "node-stop-late")
+    assert not last.all(*NODE_FAILURES, "cpu-throttled", "node-stop-late")
 
 
 @pytest.mark.parametrize(
