@@ -8,6 +8,8 @@ from typing import NamedTuple
 RUNTIME_NAME = "dora-systemd"
 NOTICE_NAME = "dora-systemd-notice"
 """The directory with a directory for each dataflow that has on_failure, see systemd.path(5)."""
+_CONTAINER_MARKS = (".dockerenv", "run/.containerenv")
+"""Files by which docker and podman mark a container."""
 
 
 class Scope(NamedTuple):
@@ -68,3 +70,20 @@ def config_home(environment: Mapping[str, str]) -> str:
     if given.startswith("/"):
         return given
     return f"{home}/.config" if home.startswith("/") else ""
+
+
+def without_systemd(root: Path = Path("/")) -> str:
+    """Describe how to boot this machine with systemd; "" if it was. root: has all its files."""
+    if (root / "run/systemd/system").is_dir():
+        return ""
+    try:
+        kernel = (root / "proc/sys/kernel/osrelease").read_text(errors="replace").lower()
+    except OSError:
+        kernel = ""
+    if "microsoft" in kernel:
+        how = "write systemd=true below [boot] in /etc/wsl.conf, then run: wsl --shutdown"
+        return f"WSL starts systemd only if told to: {how}"
+    if any((root / mark).exists() for mark in _CONTAINER_MARKS):
+        how = "boot it with /sbin/init, as podman run --systemd=always does, or use its host"
+        return f"this container runs no systemd: {how}"
+    return "this machine was not booted with systemd: make it the init system, and boot again"

@@ -32,6 +32,7 @@ from dora_systemd.decisions.views.diagnosis import (
     judge_huge_pages,
     judge_port,
     judge_processes,
+    judge_properties,
     judge_rate,
     judge_systemd,
 )
@@ -83,6 +84,7 @@ def examine(
     reach: Callable[[Scope], Manager], scope: Scope, root: Path = Path("/")
 ) -> list[Finding]:
     """Yield all findings. reach: opens the connection to systemd. root: has all files."""
+    version = ""
     try:
         manager = reach(scope)
         version = manager.version()
@@ -92,7 +94,8 @@ def examine(
         found = [judge_systemd(version)]
         found += [one for check in _WITH_SYSTEMD for one in guarded(check, manager, scope, root)]
     found += [*_journal(reach, scope), *_stops(reach, scope)]
-    return found + [one for check in _WITHOUT for one in check(scope, root)]
+    found += [one for check in _WITHOUT for one in check(scope, root)]
+    return [*found, *judge_properties(version)]
 
 
 def guarded(
@@ -113,7 +116,11 @@ def guarded(
 
 
 def _controllers(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
-    group = cgroup.group_path(manager.control_group())
+    try:
+        group = cgroup.group_path(manager.control_group())
+    except DoraSystemdError as error:  # no dataflow can start
+        yield Finding("cgroup", State.PROBLEM, error.message, error.hint)
+        return
     available = cgroup.read_controllers(group)
     yield judge_controllers(available, scope.is_user)
     yield judge_cpuset(available, scope.is_user)

@@ -14,7 +14,7 @@ from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_readable
-from dora_systemd.scope import Scope
+from dora_systemd.scope import Scope, without_systemd
 from dora_systemd.trust.paths import user_name
 
 SERVICE = b"org.freedesktop.systemd1"
@@ -34,8 +34,6 @@ _TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
 _FIRST_PERSON = 1000
 """Users with smaller numbers are system accounts."""
 _environment = _thread.allocate_lock()  # threading takes a while to load
-_CONTAINER_MARKS = (".dockerenv", "run/.containerenv")
-"""Files by which docker and podman mark a container."""
 _CLOSE = (-1, None)
 """pystemd's mark for the end of a container."""
 
@@ -223,24 +221,9 @@ def silent_bus(scope: Scope, is_private: bool) -> DoraSystemdError:
     return DoraSystemdError(message, f"see systemctl {flag}{verb}", ExitCode.NO_SYSTEMD)
 
 
-def without_systemd(root: Path = Path("/")) -> str:
-    """Describe how to boot this machine with systemd. root: the directory with all its files."""
-    try:
-        kernel = (root / "proc/sys/kernel/osrelease").read_text(errors="replace").lower()
-    except OSError:
-        kernel = ""
-    if "microsoft" in kernel:
-        how = "write systemd=true below [boot] in /etc/wsl.conf, then run: wsl --shutdown"
-        return f"WSL starts systemd only if told to: {how}"
-    if any((root / mark).exists() for mark in _CONTAINER_MARKS):
-        how = "boot it with /sbin/init, as podman run --systemd=always does, or use its host"
-        return f"this container runs no systemd: {how}"
-    return "this machine was not booted with systemd: make it the init system, and boot again"
-
-
 def _connection_hint(scope: Scope) -> str:
-    if not Path("/run/systemd/system").is_dir():
-        return without_systemd()
+    if absent := without_systemd():
+        return absent
     if not scope.is_user:
         return "see systemctl is-system-running"
     user = user_name(scope.uid, nameless="")

@@ -28,7 +28,7 @@ from dora_systemd.decisions.logs.query import (
 from dora_systemd.decisions.views.findings import Place
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
-from dora_systemd.scope import Scope
+from dora_systemd.scope import Scope, without_systemd
 
 _MOST_BEHIND, _AGAIN = 2.0, 0.1
 """Seconds that journald may take on a busy machine to write a record, and between two reads."""
@@ -313,7 +313,7 @@ def check_readable(scope: Scope, root: Path | None = None) -> None:
     if any(os.access(path, os.R_OK) for path in files):
         return
     if not files:
-        hint = "is systemd-journald running?"
+        hint = without_systemd(root) or "see systemctl status systemd-journald"
         raise DoraSystemdError("cannot find a journal on this machine", hint, ExitCode.NO_SYSTEMD)
     if not scope.is_user:
         raise DoraSystemdError("cannot read the system's journal", JOIN, ExitCode.NO_PERMISSION)

@@ -1,4 +1,11 @@
-"""Drops properties that older versions of systemd lack, with warnings."""
+"""Drops properties that older versions of systemd lack, with warnings.
+
+Not used of newer versions, even if they are there: RESTART_RESET=1 (258) would also set NRestarts=
+to 0, and the runner resets its delay itself, see dora_systemd.runner.cell.restarts.
+ConcurrencySoftMax= (258) counts active units, so with 4 in dora.slice no fifth dataflow would start
+before one of the others ends. OOMKills (259) is of a whole unit, and the runner reads the counters
+of each node.
+"""
 
 import re
 from collections.abc import Iterable, Mapping

@@ -58,17 +58,34 @@ def judge_systemd(version: str) -> Finding:
     # Imported late: it has all properties, and verbs that read processes judge no systemd.
     from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, lacking
 
-    match = re.match(r"\d+", version)
-    number = int(match[0]) if match else MIN_VERSION
+    number = _number(version) or MIN_VERSION
     if number < MIN_VERSION:
         text = f"version {version} is too old"
         return Finding("systemd", State.PROBLEM, text, f"upgrade to {MIN_VERSION} or newer")
-    missing = lacking(number)
-    if missing:
-        text = f"version {version} lacks {', '.join(missing)}"
-        remedy = "dataflows run; settings that need one of these are left out with a warning"
+    if missing := lacking(number):
+        text = f"version {version} lacks {len(missing)} properties, see the end"
+        remedy = "dataflows run; such a setting is left out with a warning"
         return Finding("systemd", State.NOTE, text, remedy)
     return Finding("systemd", State.OK, f"version {version}")
+
+
+def judge_properties(version: str) -> Iterator[Finding]:
+    """Name the properties that this version of systemd lacks; "" for a systemd that is not there.
+
+    They would fill the screen, so they have a finding of their own, which is the last one.
+    """
+    from dora_systemd.decisions.unit.systemd_versions import MIN_VERSION, lacking
+
+    number = _number(version) or MIN_VERSION
+    missing = lacking(number) if version and number >= MIN_VERSION else ()
+    if missing:
+        text = f"systemd {version} lacks {', '.join(missing)}"
+        yield Finding("properties", State.NOTE, text)
+
+
+def _number(version: str) -> int:
+    match = re.match(r"\d+", version)
+    return int(match[0]) if match else 0
 
 
 def judge_controllers(available: Collection[str], is_user: bool) -> Finding:

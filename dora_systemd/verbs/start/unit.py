@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup.groups import mount_point
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.needs.words import needs_of
 from dora_systemd.decisions.properties.assignments import (
@@ -47,6 +48,7 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     DoraSystemdError.
     """
     needs, allowed = plan.settings[NEEDS], plan.settings[DEVICE]
+    mount_point()  # no runner starts without cgroup v2
     check_needs(manager, Needy(plan.options.name, plan.scope.is_user, needs))
     number = systemd_number(manager)
     check_units(manager, plan.scope, plan.options)

@@ -23,21 +23,6 @@ USER = Scope(is_user=True, uid=1000)
 CLOSE = (-1, None)
 
 
-@pytest.mark.parametrize(
-    ("file", "text", "expected"),
-    [
-        ("proc/sys/kernel/osrelease", "6.6.87-microsoft-standard-WSL2\n", "/etc/wsl.conf"),
-        (".dockerenv", "", "podman run --systemd=always"),
-        ("run/.containerenv", "", "podman run --systemd=always"),
-        ("proc/sys/kernel/osrelease", "6.12.1-arm64\n", "make it the init system"),
-    ],
-)
-def test_machines_without_systemd(tmp_path: Path, file: str, text: str, expected: str) -> None:
-    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / file).write_text(text)
-    assert expected in connection.without_systemd(tmp_path)
-
-
 def test_basic_types() -> None:
     assert encoded("s", "ä") == [(ord("s"), "ä".encode())]
     assert encoded("b", True) == [(ord("b"), True)]

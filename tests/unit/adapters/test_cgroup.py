@@ -8,7 +8,7 @@ import pytest
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.limits import limit_groups
 from dora_systemd.decisions.resources.usage import Usage
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
 from tests.unit.fakes.limit_values import limits_from
 
@@ -149,6 +149,19 @@ def test_groups_are_made_and_removed(tmp_path: Path) -> None:
     cgroup.remove_group(tmp_path / "x")
     cgroup.remove_group(tmp_path / "x")
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("place", ["cgroup", "cgroup/unified"])
+def test_where_cgroup_v2_is(tmp_path: Path, place: str) -> None:
+    places = (tmp_path / "cgroup", tmp_path / "cgroup/unified")
+    for one in places:
+        one.mkdir()
+    with pytest.raises(DoraSystemdError, match=r"^cannot find the cgroup v2 hierarchy") as caught:
+        cgroup.mount_point(places)
+    assert caught.value.code is ExitCode.NO_SYSTEMD
+    assert "systemd.unified_cgroup_hierarchy=1" in caught.value.hint
+    (tmp_path / place / "cgroup.procs").touch()
+    assert cgroup.mount_point(places) == tmp_path / place
 
 
 def test_own_group() -> None:

@@ -72,7 +72,7 @@ _TABLE = {
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.start.needs
         verbs.machines.register
-        verbs.logs verbs.setup verbs.show verbs.start.enable verbs.up
+        scope verbs.logs verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """
         cli.group gateway.routes

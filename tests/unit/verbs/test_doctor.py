@@ -95,6 +95,14 @@ def test_without_systemd(manager: FakeManager, scope: Scope) -> None:
     assert {one.topic for one in rest} >= {"journal", "dora", "bare dora"}
 
 
+def test_what_an_old_systemd_lacks_comes_last(manager: FakeManager, scope: Scope) -> None:
+    manager.systemd = "252.39-1~deb12u1"
+    first, *_, last = look(manager, scope)
+    assert (first.topic, last.topic) == ("systemd", "properties")
+    assert "DelegateSubgroup" in last.text
+    assert "DelegateSubgroup" not in first.text
+
+
 def journal_lines(manager: FakeManager, scope: Scope) -> list[str]:
     return [f"{one.state}: {one.text}" for one in look(manager, scope) if one.topic == "journal"]
 
@@ -339,14 +347,15 @@ def test_linger(manager: FakeManager, tmp_path: Path) -> None:
     assert "linger" not in found(manager, user)
 
 
-def test_a_check_that_fails_is_a_finding(
+def test_without_cgroup_v2_nothing_starts(
     manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail() -> str:
         raise DoraSystemdError("cannot find the cgroup v2 hierarchy", "", ExitCode.NO_SYSTEMD)
 
     monkeypatch.setattr(manager, "control_group", fail)
-    assert "cannot find the cgroup v2" in found(manager, scope)["controllers"].text
+    assert "cannot find the cgroup v2" in found(manager, scope)["cgroup"].text
+    assert found(manager, scope)["cgroup"].state is State.PROBLEM
 
 
 def test_what_a_check_has_found_before_it_fails_is_told(

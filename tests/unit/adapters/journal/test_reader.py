@@ -203,7 +203,8 @@ def test_count(journalctl: Path) -> None:
         (SYSTEM, "var", ExitCode.NO_PERMISSION, "systemd-journal"),
         (USER, "var", None, ""),
         (USER, "run", ExitCode.NO_PERMISSION, "Storage=persistent"),
-        (SYSTEM, "none", ExitCode.NO_SYSTEMD, "journald"),
+        (SYSTEM, "none", ExitCode.NO_SYSTEMD, "systemctl status systemd-journald"),
+        (SYSTEM, "no systemd", ExitCode.NO_SYSTEMD, "not booted with systemd"),
     ],
 )
 def test_unreadable(
@@ -214,7 +215,9 @@ def test_unreadable(
     code: ExitCode | None,
     word: str,
 ) -> None:
-    if where != "none":
+    if where != "no systemd":
+        (tmp_path / "run/systemd/system").mkdir(parents=True)
+    if where in ("var", "run"):
         directory = tmp_path / where / "log/journal/machine"
         directory.mkdir(parents=True)
         (directory / "system.journal").touch()

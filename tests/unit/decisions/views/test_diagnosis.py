@@ -7,6 +7,7 @@ from dora_systemd.decisions.views.diagnosis import (
     judge_controllers,
     judge_port,
     judge_processes,
+    judge_properties,
     judge_rate,
     judge_systemd,
 )
@@ -26,8 +27,8 @@ USER_CELL = "/user.slice/user-1000.slice/user@1000.service/dora.slice/dora-a.ser
     ("version", "state", "part"),
     [
         ("257.13-1~deb13u1", State.OK, "257.13"),
-        ("252.39-1~deb12u1", State.NOTE, "DelegateSubgroup"),
-        ("256", State.NOTE, "PrivatePIDs"),
+        ("252.39-1~deb12u1", State.NOTE, "properties, see the end"),
+        ("256", State.NOTE, "lacks"),
         ("251", State.PROBLEM, "too old"),
         ("devel", State.NOTE, "lacks"),
     ],
@@ -36,6 +37,30 @@ def test_systemd(version: str, state: State, part: str) -> None:
     found = judge_systemd(version)
     assert found.state is state
     assert part in found.text
+
+
+@pytest.mark.parametrize(
+    ("version", "names"),
+    [
+        ("252.39-1~deb12u1", ["DelegateSubgroup", "RestartSteps", "PrivatePIDs"]),
+        ("256", ["PrivatePIDs"]),
+        ("257.13-1~deb13u1", []),
+        ("251", []),  # which is a problem of its own
+        ("", []),
+    ],
+)
+def test_properties_that_systemd_lacks(version: str, names: list[str]) -> None:
+    found = list(judge_properties(version))
+    assert len(found) == bool(names)
+    for one in found:
+        assert one.state is State.NOTE
+        assert set(names) <= set(one.text.replace(",", "").split())
+
+
+def test_an_old_systemd_needs_two_lines_of_a_small_terminal() -> None:
+    """Its name and its remedy, with the longest topic beside it."""
+    both = [judge_systemd("252.39-1~deb12u2"), Finding("port 53290", State.OK, "free")]
+    assert len(format_findings(both, 80).splitlines()) == 3
 
 
 def test_controllers() -> None:
