@@ -44,7 +44,7 @@ WITH_TOOLS = (
 # Stops between two restarts of a machine, which come after other kinds of stops each time.
 STAGE = 9
 # What `make test` runs on the next Debian: what differs there.
-NEW = "versions or doctor or units or life or newer or account or ordinary or pipx"
+NEW = "versions or doctor or units or life or newer or account or ordinary or pip"
 # Far more than any test takes: one that hangs fails and shows where, and the others run.
 PYTEST = ("pytest", "--timeout=900")
 # A dataflow as a service, from start to stop: what to run after every change.

@@ -1,9 +1,10 @@
-"""What an ordinary user has without root and without a compiler: wheels, by uv or pipx."""
+"""Without the packages and a compiler: wheels by uv or pipx for a user, and by pip for root."""
 
 import json
 import pwd
 import re
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -12,6 +13,7 @@ import pytest
 
 from tests.deb.packages import caller, make_venv
 from tests.platforms import test_packages
+from tests.platforms.table import HERE
 from tests.system.cells import Project, run, wait_for, wait_no_process
 from tests.system.typed import Shell, as_text, type_line, typed_lines
 
@@ -32,6 +34,8 @@ ENVIRONMENT = (
     f"PIPX_HOME={HOME}/pipx",
 )
 """Of USER, who finds uv and what it has installed. There is no network here."""
+DORACTL = "/opt/dora-systemd/bin/doractl"
+"""The command that pip installs for root, as docs/install.md says."""
 
 
 def as_user(line: str, check: bool = True) -> CompletedProcess[str]:
@@ -43,6 +47,12 @@ def as_user(line: str, check: bool = True) -> CompletedProcess[str]:
 def lines_of(program: str) -> list[str]:
     """What docs/install.md says to type of that program."""
     return re.findall(rf"^(?:\$ )?({program} .*)$", PAGE.read_text(), re.MULTILINE)
+
+
+def block_below(words: str) -> list[str]:
+    """The lines of the first block of docs/install.md below these words."""
+    (block,) = re.findall(rf"^{words}\n+```\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    return str(block).splitlines()
 
 
 def offer_wheels() -> None:
@@ -117,3 +127,39 @@ def test_five_minutes_with_pipx(flow: Path) -> None:
     assert "Dataflow restarted: " in as_user("doractl restart robot").stdout
     assert "Dataflow enabled: " in as_user("doractl enable robot").stdout
     assert "Dataflow stopped: " in as_user("doractl stop robot").stdout
+
+
+def as_root(line: str, check: bool = True) -> CompletedProcess[str]:
+    """Run a line in a shell of root, in the checkout. pip finds what PyPI has, and setuptools."""
+    places = f"PIP_FIND_LINKS={CHECKOUT}/dist/wheels /usr/share/python-wheels"
+    shell = ("env", "PIP_NO_INDEX=1", places, "sh", "-c", f"cd {CHECKOUT}; {line}")
+    return test_packages.as_user("root", *shell, check=check)
+
+
+@pytest.fixture
+def by_pip(bare: None) -> Iterator[Path]:
+    """A machine without the packages, and a dataflow; afterwards without what pip has installed."""
+    del bare
+    root = Path(tempfile.mkdtemp(prefix="pip-", dir="/var/tmp"))
+    root.chmod(0o755)
+    yield Project(root / "project").three_nodes()
+    as_root(f"{DORACTL} destroy --force; {DORACTL} setup --remove", check=False)
+    shutil.rmtree(Path(DORACTL).parents[1])
+    shutil.rmtree(root)
+
+
+@pytest.mark.skipif(HERE.python == "3.11", reason="its setuptools needs wheel, which PyPI has")
+def test_pip_as_root(by_pip: Path) -> None:
+    """The page's lines; doractl is beside that Python, and so is dora."""
+    for line in block_below("As root, with pip:"):
+        said = as_root(line).stdout
+    assert said.startswith("Installed: ")
+    assert pwd.getpwnam("dora").pw_shell == "/usr/sbin/nologin"
+    command = f"{DORACTL} start {by_pip} --name robot --venv /opt/lab --network host --enable"
+    assert as_root(command).stdout.startswith("Dataflow started: ")
+    assert "3/3 nodes running" in as_root(f"{DORACTL} why robot").stdout
+    assert run("systemctl", "is-enabled", "dora-robot").stdout == "enabled\n"
+    shown = json.loads(as_root(f"{DORACTL} version -o json").stdout)
+    assert (shown["python"].startswith(HERE.python), shown["dora"]) == (True, "1.1.0")
+    assert "Dataflow disabled: " in as_root(f"{DORACTL} disable robot").stdout
+    assert "Dataflow stopped: " in as_root(f"{DORACTL} stop robot").stdout
