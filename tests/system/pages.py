@@ -6,6 +6,8 @@ from typing import Any
 from tests.system.chromium import Browser
 
 AXE = Path("/opt/axe/axe_playwright_python/axe.min.js")
+SCHEMES = ("light", "dark")
+"""What readers can choose."""
 _JUDGED = """
 axe.run(document, {resultTypes: ['violations']}).then((found) => found.violations.map(
   (one) => [one.id, one.help, ...one.nodes.map((node) => node.html.slice(0, 300))]))

@@ -16,26 +16,6 @@ from tests.system.cells import Cell, Project, is_alive, run, wait_for
 LOST = ("is lost", "failed", "Failed", "exited", "connection error", "disconnected")
 
 
-def test_status_shows_the_tree(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    tree = cell.systemctl("status", "--no-pager", "--lines=0")
-    for part in ("supervisor", "node-source", "node-doubler", "node-sink"):
-        assert f"─{part}\n" in tree
-    assert 'Status: "3/3 nodes running"' in tree
-    assert len(cell.pids("supervisor")) == 3
-    for node in ("source", "doubler", "sink"):
-        assert cell.pids(f"node-{node}") == [cell.status.nodes[node].pid]
-    cell.wait_exchanging()
-
-
-def test_the_runner_does_without_openssl(cell: Cell, project: Project) -> None:
-    """A fifth of its memory; nothing that it imports may bring it back."""
-    cell.start(project.three_nodes())
-    maps = Path(f"/proc/{cell.supervisor_pid('runner')}/maps").read_text()
-    assert "libsystemd" in maps
-    assert "libcrypto" not in maps
-
-
 BURST = """
 import time
 time.sleep({late})
@@ -85,15 +65,6 @@ def test_stop_is_clean_and_quick(cell: Cell, project: Project) -> None:
     assert cell.show("Result") == "success"
     assert not cell.paths.root.exists()
     assert cell.events()[-1] == ("dataflow-stopped", "")
-
-
-def test_nodes_are_unprivileged_and_the_directory_is_private(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    uids = {Path(f"/proc/{pid}").stat().st_uid for pid in cell.all_pids()}
-    assert len(uids) == 1
-    assert 0 not in uids
-    assert stat.S_IMODE(cell.paths.root.stat().st_mode) == 0o700
-    assert stat.S_IMODE(cell.paths.control.stat().st_mode) == 0o600
 
 
 def test_nodes_see_nothing_of_ours_and_nothing_of_systemd(cell: Cell, project: Project) -> None:
@@ -313,23 +284,48 @@ def test_values_of_env_reach_the_node_and_not_the_journal(cell: Cell, project: P
     assert "hunter2" not in json.dumps(cell.journal())
 
 
-def test_everything_listens_on_loopback_and_nothing_by_udp(cell: Cell, project: Project) -> None:
-    """With multicast two cells would find each other."""
-    cell.start(project.three_nodes())
-    pids = {f"pid={pid}," for pid in cell.all_pids()}
-    tcp = run("ss", "-Hltnp").stdout.splitlines()
-    ours = [line.split()[3] for line in tcp if any(pid in line for pid in pids)]
-    assert ours
-    assert not [address for address in ours if not address.startswith("127.0.0.1:")]
-    udp = run("ss", "-Hlunp").stdout.splitlines()
-    assert not [line for line in udp if any(pid in line for pid in pids)]
+class TestWhatRuns:
+    """All of them look at the same dataflow."""
 
+    def test_status_shows_the_tree(self, running: Cell) -> None:
+        tree = running.systemctl("status", "--no-pager", "--lines=0")
+        for part in ("supervisor", "node-source", "node-doubler", "node-sink"):
+            assert f"─{part}\n" in tree
+        assert 'Status: "3/3 nodes running"' in tree
+        assert len(running.pids("supervisor")) == 3
+        for node in ("source", "doubler", "sink"):
+            assert running.pids(f"node-{node}") == [running.status.nodes[node].pid]
+        running.wait_exchanging()
 
-def test_output_files_of_dora_die_with_the_unit(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    assert (cell.paths.work / "out" / cell.status.run).is_dir()
-    assert not (project.root / "out").exists()
-    # DORA_QUIET=1: dora's own copy of what the nodes print stays empty.
-    cell.wait_exchanging()
-    copies = list((cell.paths.work / "out" / cell.status.run).glob("log_*.jsonl"))
-    assert sum(path.stat().st_size for path in copies) == 0
+    def test_the_runner_does_without_openssl(self, running: Cell) -> None:
+        """A fifth of its memory; nothing that it imports may bring it back."""
+        maps = Path(f"/proc/{running.supervisor_pid('runner')}/maps").read_text()
+        assert "libsystemd" in maps
+        assert "libcrypto" not in maps
+
+    def test_nodes_are_unprivileged_and_the_directory_is_private(self, running: Cell) -> None:
+        uids = {Path(f"/proc/{pid}").stat().st_uid for pid in running.all_pids()}
+        assert len(uids) == 1
+        assert 0 not in uids
+        assert stat.S_IMODE(running.paths.root.stat().st_mode) == 0o700
+        assert stat.S_IMODE(running.paths.control.stat().st_mode) == 0o600
+
+    def test_everything_listens_on_loopback_and_nothing_by_udp(self, running: Cell) -> None:
+        """With multicast two cells would find each other."""
+        pids = {f"pid={pid}," for pid in running.all_pids()}
+        tcp = run("ss", "-Hltnp").stdout.splitlines()
+        ours = [line.split()[3] for line in tcp if any(pid in line for pid in pids)]
+        assert ours
+        assert not [address for address in ours if not address.startswith("127.0.0.1:")]
+        udp = run("ss", "-Hlunp").stdout.splitlines()
+        assert not [line for line in udp if any(pid in line for pid in pids)]
+
+    def test_output_files_of_dora_die_with_the_unit(
+        self, running: Cell, class_project: Project
+    ) -> None:
+        assert (running.paths.work / "out" / running.status.run).is_dir()
+        assert not (class_project.root / "out").exists()
+        # DORA_QUIET=1: dora's own copy of what the nodes print stays empty.
+        running.wait_exchanging()
+        copies = list((running.paths.work / "out" / running.status.run).glob("log_*.jsonl"))
+        assert sum(path.stat().st_size for path in copies) == 0

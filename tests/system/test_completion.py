@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.system.cells import Cell, Project, run
+from tests.system.cells import Cell, run
 from tests.system.shells import SHELLS
 
 # `doractl setup` puts the scripts where the shells of everybody look.
@@ -19,19 +19,25 @@ def installed() -> Iterator[None]:
     run("doractl", "setup", "--remove")
 
 
-@pytest.mark.parametrize("shell", SHELLS)
-def test_dataflows_and_nodes_that_run(shell: str, cell: Cell, project: Project) -> None:
-    ask = SHELLS[shell]
-    cell.start(project.three_nodes())
-    begun = cell.name[:-1]
-    for verb in ("stop", "node restart", "logs --follow"):
-        assert ask(f"doractl {verb} {begun}", ()) == [cell.name]
-    (row,) = json.loads(cell.doractl("list", "-o", "json").stdout)
-    assert ask(f"doractl --system show {row['uuid'][:8]}", ()) == [row["uuid"]]
-    assert ask(f"doractl node restart {cell.name} so", ()) == ["source"]
-    nodes = f"doractl logs {cell.name} --node d"
-    assert ask(nodes, ()) == ["doubler"], f"bash: {SHELLS['bash'](nodes, ())}"
-    assert cell.name not in ask(f"doractl stop {cell.name} {begun}", ()), "it is given already"
-    assert ask("doractl sto", ()) == ["stop"]
-    cell.doractl("stop", cell.name)
-    assert cell.name not in ask("doractl stop ", ())
+class TestWhatRuns:
+    """In each shell."""
+
+    @pytest.mark.parametrize("shell", SHELLS)
+    def test_dataflows_and_nodes(self, shell: str, running: Cell) -> None:
+        ask = SHELLS[shell]
+        begun = running.name[:-1]
+        for verb in ("stop", "node restart", "logs --follow"):
+            assert ask(f"doractl {verb} {begun}", ()) == [running.name]
+        (row,) = json.loads(running.doractl("list", "-o", "json").stdout)
+        assert ask(f"doractl --system show {row['uuid'][:8]}", ()) == [row["uuid"]]
+        assert ask(f"doractl node restart {running.name} so", ()) == ["source"]
+        nodes = f"doractl logs {running.name} --node d"
+        assert ask(nodes, ()) == ["doubler"], f"bash: {SHELLS['bash'](nodes, ())}"
+        assert running.name not in ask(f"doractl stop {running.name} {begun}", ()), "given already"
+        assert ask("doractl sto", ()) == ["stop"]
+
+    def test_what_has_stopped(self, running: Cell) -> None:
+        """The last one: no shell offers it again."""
+        running.doractl("stop", running.name)
+        for ask in SHELLS.values():
+            assert running.name not in ask("doractl stop ", ())

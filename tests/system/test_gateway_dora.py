@@ -118,8 +118,8 @@ def dora(front: Front) -> Dora:
     return Dora(front)
 
 
-@pytest.fixture
-def places() -> Iterator[Sequence[Project]]:
+@contextmanager
+def new_places() -> Iterator[Sequence[Project]]:
     """Directories of alice, of bob, and of alice again."""
     root = Path(tempfile.mkdtemp(prefix="flows-", dir="/var/tmp"))
     root.chmod(0o755)
@@ -134,10 +134,9 @@ def places() -> Iterator[Sequence[Project]]:
     shutil.rmtree(root)
 
 
-@pytest.fixture
-def three(dora: Dora, cell: Cell, places: Sequence[Project]) -> Iterator[list[Cell]]:
-    """Three dataflows of two users; `cell` holds the rules about what may be left of them."""
-    del cell
+@contextmanager
+def started(dora: Dora, places: Sequence[Project]) -> Iterator[list[Cell]]:
+    """Three dataflows of two users."""
     cells = [Cell(name) for name in ("one", "two", "three")]
     flows = [str(place.root / "dataflow.yml") for place in places]
     options = [("--name", one.name, "--detach", "--debug") for one in cells]
@@ -150,34 +149,33 @@ def three(dora: Dora, cell: Cell, places: Sequence[Project]) -> Iterator[list[Ce
             one.end()
 
 
+@pytest.fixture
+def places() -> Iterator[Sequence[Project]]:
+    with new_places() as places:
+        yield places
+
+
+@pytest.fixture
+def three(dora: Dora, cell: Cell, places: Sequence[Project]) -> Iterator[list[Cell]]:
+    """Three dataflows; `cell` holds the rules about what may be left of them."""
+    del cell
+    with started(dora, places) as cells:
+        yield cells
+
+
+@pytest.fixture(scope="class")
+def same_three(class_cell: Cell) -> Iterator[list[Cell]]:
+    """The same for tests that stop none of them."""
+    del class_cell
+    front = Front()
+    front.up()
+    with new_places() as places, started(Dora(front), places) as cells:
+        front.end()
+        yield cells
+
+
 def uuids(dora: Dora) -> dict[str, str]:
     return {one["name"]: one["uuid"] for one in dora.json_lines("list", "--status", "running")}
-
-
-def test_lists_and_nodes(dora: Dora, three: list[Cell]) -> None:
-    listed = dora.json_lines("list", "--status", "running")
-    found = {one["name"]: one for one in listed}
-    assert sorted(found) == ["one", "three", "two"]
-    for cell in three:
-        assert found[cell.name]["uuid"] == cell.status.uuid
-        assert found[cell.name]["nodes"] == 3
-        assert found[cell.name]["memory"] > 0.05
-    assert [cell.show("User") for cell in three] == ["alice", "bob", "alice"]
-    nodes = dora.json_lines("node", "list", "-d", "two")
-    assert {one["node"]: int(one["pid"]) for one in nodes} == {
-        name: node.pid for name, node in three[1].status.nodes.items()
-    }
-    assert len(dora("node", "list", "--quiet").stdout.split()) == 9
-    info = json.loads(dora("node", "info", "doubler", "-d", "two", "--format", "json").stdout)
-    assert "doubler.py" in json.dumps(info)
-    assert "launcher" not in json.dumps(info)
-    top = json.loads(dora("top", "--once").stdout)
-    assert len(top) == 9
-    assert all(one["metrics"]["pid"] for one in top)
-    status = dora("status").stdout
-    assert "Active dataflows: 3" in status
-    assert "✓ Daemon: Running" in status
-    assert dora("doctor").returncode == 0
 
 
 # What dora's own coordinator says when it publishes for the first time.
@@ -222,18 +220,6 @@ def test_single_nodes(dora: Dora, three: list[Cell]) -> None:
     assert "(dora node stop)" in three[1].status.nodes["sink"].asked_by
     assert three[1].status.nodes["source"].restarts == 0
     assert [three[n].status.nodes for n in (0, 2)] == [before[0], before[2]]
-
-
-@pytest.mark.warns("on shutdown")
-def test_a_restart_that_is_inhibited(dora: Dora, three: list[Cell]) -> None:
-    two = three[1]
-    before = two.show("InvocationID")
-    with (two.scope.cell_directory("two") / "inhibit.lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_SH)
-        assert "cannot restart two: inhibited by" in dora.refusal("restart", "two")
-    assert two.show("InvocationID") == before
-    dora("restart", "two")
-    assert two.show("InvocationID") != before
 
 
 @pytest.mark.warns("on shutdown")
@@ -410,53 +396,6 @@ def test_numbers_that_dora_cannot_send(dora: Dora, cell: Cell, places: Sequence[
     assert "env 'B' is infinite or not a number" in refused.stderr
 
 
-@pytest.mark.warns("control request failed: node `sonk` not found")
-def test_refusals(dora: Dora, three: list[Cell], places: Sequence[Project]) -> None:
-    for words, expected in (
-        (("stop", NO_SUCH_UUID), "no dataflow with the UUID"),
-        (("stop", "tow"), "did you mean two?"),
-        (("restart", "nobody"), "no dataflow named 'nobody'"),
-        (("logs", NO_SUCH_UUID, "--node", "a"), "no dataflow with the UUID"),
-        (("logs", "two", "--node", "sonk"), "did you mean sink?"),
-        (("node", "restart", "sonk", "-d", "two"), "did you mean sink?"),
-        (("node", "stop", "sonk", "-d", "two"), "did you mean sink?"),
-        (("param", "get", "-d", "two", "sonk", "x"), "not found"),
-        (("topic", "echo", "-d", "two", "sonk/x", "--count", "1"), "sonk"),
-        (("clean",), "the journal"),
-        (("trace", "list"), "doractl dora NAME"),
-        (("down",), "refusing to destroy"),
-    ):
-        assert expected in dora.refusal(*words), words
-    assert [cell.show("ActiveState") for cell in three] == ["active"] * 3
-    node = places[0].write("node.yml", "{id: more, path: more.py}\n")
-    error = dora.refusal("node", "add", "-d", "two", "--from-yaml", str(node))
-    assert "cannot change a supervised dataflow" in error
-
-
-def test_who_may(dora: Dora, front: Front, three: list[Cell]) -> None:
-    as_bob = ("runuser", "-u", "bob", "--", "env", "HOME=/home/bob", "dora")
-    for words in (("list",), ("stop", "--all"), ("logs", "two")):
-        done = run(*as_bob, *words, check=False, env=dora.environment)
-        assert done.returncode == 1
-        assert "401 Unauthorized" in done.stderr or "no out/ directory" in done.stderr, words
-    with_token = {**dora.environment, "DORA_AUTH_TOKEN": front.token}
-    assert "two" in run(*as_bob, "list", env=with_token).stdout
-    assert [cell.show("ActiveState") for cell in three] == ["active"] * 3
-
-
-@pytest.mark.warns("dora-gateway.service: Main process exited", "Failed with result 'signal'")
-def test_killed_while_logs_are_followed(dora: Dora, front: Front, three: list[Cell]) -> None:
-    before = [cell.all_pids() for cell in three]
-    with dora.running("logs", "two", "--follow") as follow:
-        read_until(follow, "sent 5")
-        os.kill(front.pid, signal.SIGKILL)
-        follow.wait(30)
-    assert [cell.all_pids() for cell in three] == before
-    three[1].wait_exchanging()
-    # The next command finds another gateway.
-    assert sorted(uuids(dora)) == ["one", "three", "two"]
-
-
 def test_one_that_is_enabled(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
     """The unit file of one that was disabled while it ran is in the way of the next start."""
     flow = places[0].root / "dataflow.yml"
@@ -498,3 +437,88 @@ def test_nothing_stays_behind(
 
 def _descriptors(pid: int) -> int:
     return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+@pytest.mark.warns("dora-gateway.service: Main process exited", "Failed with result 'signal'")
+@pytest.mark.warns("control request failed: node `sonk` not found", "on shutdown")
+class TestSameThree:
+    """None of them is stopped."""
+
+    def test_killed_while_logs_are_followed(
+        self, dora: Dora, front: Front, same_three: list[Cell]
+    ) -> None:
+        before = [cell.all_pids() for cell in same_three]
+        with dora.running("logs", "two", "--follow") as follow:
+            read_until(follow, "sent 5")
+            os.kill(front.pid, signal.SIGKILL)
+            follow.wait(30)
+        assert [cell.all_pids() for cell in same_three] == before
+        same_three[1].wait_exchanging()
+        # The next command finds another gateway.
+        assert sorted(uuids(dora)) == ["one", "three", "two"]
+
+    def test_lists_and_nodes(self, dora: Dora, same_three: list[Cell]) -> None:
+        listed = dora.json_lines("list", "--status", "running")
+        found = {one["name"]: one for one in listed}
+        assert sorted(found) == ["one", "three", "two"]
+        for cell in same_three:
+            assert found[cell.name]["uuid"] == cell.status.uuid
+            assert found[cell.name]["nodes"] == 3
+            assert found[cell.name]["memory"] > 0.05
+        assert [cell.show("User") for cell in same_three] == ["alice", "bob", "alice"]
+        nodes = dora.json_lines("node", "list", "-d", "two")
+        assert {one["node"]: int(one["pid"]) for one in nodes} == {
+            name: node.pid for name, node in same_three[1].status.nodes.items()
+        }
+        assert len(dora("node", "list", "--quiet").stdout.split()) == 9
+        info = json.loads(dora("node", "info", "doubler", "-d", "two", "--format", "json").stdout)
+        assert "doubler.py" in json.dumps(info)
+        assert "launcher" not in json.dumps(info)
+        top = json.loads(dora("top", "--once").stdout)
+        assert len(top) == 9
+        assert all(one["metrics"]["pid"] for one in top)
+        status = dora("status").stdout
+        assert "Active dataflows: 3" in status
+        assert "✓ Daemon: Running" in status
+        assert dora("doctor").returncode == 0
+
+    def test_refusals(self, dora: Dora, same_three: list[Cell], places: Sequence[Project]) -> None:
+        for words, expected in (
+            (("stop", NO_SUCH_UUID), "no dataflow with the UUID"),
+            (("stop", "tow"), "did you mean two?"),
+            (("restart", "nobody"), "no dataflow named 'nobody'"),
+            (("logs", NO_SUCH_UUID, "--node", "a"), "no dataflow with the UUID"),
+            (("logs", "two", "--node", "sonk"), "did you mean sink?"),
+            (("node", "restart", "sonk", "-d", "two"), "did you mean sink?"),
+            (("node", "stop", "sonk", "-d", "two"), "did you mean sink?"),
+            (("param", "get", "-d", "two", "sonk", "x"), "not found"),
+            (("topic", "echo", "-d", "two", "sonk/x", "--count", "1"), "sonk"),
+            (("clean",), "the journal"),
+            (("trace", "list"), "doractl dora NAME"),
+            (("down",), "refusing to destroy"),
+        ):
+            assert expected in dora.refusal(*words), words
+        assert [cell.show("ActiveState") for cell in same_three] == ["active"] * 3
+        node = places[0].write("node.yml", "{id: more, path: more.py}\n")
+        error = dora.refusal("node", "add", "-d", "two", "--from-yaml", str(node))
+        assert "cannot change a supervised dataflow" in error
+
+    def test_who_may(self, dora: Dora, front: Front, same_three: list[Cell]) -> None:
+        as_bob = ("runuser", "-u", "bob", "--", "env", "HOME=/home/bob", "dora")
+        for words in (("list",), ("stop", "--all"), ("logs", "two")):
+            done = run(*as_bob, *words, check=False, env=dora.environment)
+            assert done.returncode == 1
+            assert "401 Unauthorized" in done.stderr or "no out/ directory" in done.stderr, words
+        with_token = {**dora.environment, "DORA_AUTH_TOKEN": front.token}
+        assert "two" in run(*as_bob, "list", env=with_token).stdout
+        assert [cell.show("ActiveState") for cell in same_three] == ["active"] * 3
+
+    def test_a_restart_that_is_inhibited(self, dora: Dora, same_three: list[Cell]) -> None:
+        two = same_three[1]
+        before = two.show("InvocationID")
+        with (two.scope.cell_directory("two") / "inhibit.lock").open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH)
+            assert "cannot restart two: inhibited by" in dora.refusal("restart", "two")
+        assert two.show("InvocationID") == before
+        dora("restart", "two")
+        assert two.show("InvocationID") != before

@@ -9,7 +9,7 @@ from tests.system import recorders
 from tests.system.cells import TICK, Cell, Project, journalctl, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
-from tests.system.pages import CONTRAST, faults, node
+from tests.system.pages import CONTRAST, SCHEMES, faults, node
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
 
@@ -34,17 +34,6 @@ STRUCK = """
   const place = (name) => chart.querySelector(name).getBoundingClientRect();
   return [place('.top').bottom, place('.line').top];
 }).filter(([label, line]) => label > line)
-"""
-LAST = """
-import('/page/why.js').then(({ Why }) => {
-  const why = new Why(() => 0);
-  const lines = LINES.map((text) => ({ at_us: 1, node: 'cam', text }));
-  why.show({ why: {
-    status: 'Failed', summary: 'x', node: 'cam', last_lines: lines, timeline: [], remedies: [],
-    starved: [], restart_history: [], details: {}, at_us: 1,
-  } });
-  return why.node.querySelector('.words h3').textContent;
-})
 """
 
 
@@ -79,8 +68,6 @@ def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
     )
     listed = json.loads(cell.doractl("list", cell.name, "-o", "json").stdout)["nodes"]
     assert shown == [one["node"] for one in listed] == ["source", "doubler", "sink"]
-    assert browser.js(LAST.replace("LINES", json.dumps(["a"]))) == "The last line of cam"
-    assert browser.js(LAST.replace("LINES", json.dumps(["a", "b"]))) == "The last 2 lines of cam"
     assert browser.failures() == []
 
 
@@ -226,91 +213,31 @@ def test_disconnected_and_back(
     browser.wait_text("#link", "live")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_looks(scheme: str, browser: Browser, cell: Cell, project: Project) -> None:
+def look(browser: Browser, name: str) -> None:
+    """A picture of what everybody can read, in each scheme."""
+    for scheme in SCHEMES:
+        browser.prefer(scheme)
+        assert browser.js(CONTRAST) == [], scheme
+        assert faults(browser) == [], scheme
+        browser.picture(f"{name}-{scheme}", is_whole=True)
+
+
+def test_looks(browser: Browser, cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
-    browser.prefer(scheme)
     browser.wait_text(".lines", "got [")
     browser.wait_js("document.querySelectorAll('.graph .box').length === 3")
-    assert browser.js(CONTRAST) == []
-    assert faults(browser) == []
-    browser.picture(f"desktop-{scheme}", is_whole=True)
+    look(browser, "desktop")
     browser.resize(320, 740, is_phone=True)
     wait = "document.documentElement.scrollWidth"
     assert browser.wait_js(wait) == 320
-    assert browser.js(CONTRAST) == []
-    browser.picture(f"phone-{scheme}", is_whole=True)
+    look(browser, "phone")
     # The way back to the list, and no sideways scrolling there.
     browser.click(".return")
     browser.wait_js("document.body.dataset.view === 'list'")
     assert browser.js(wait) == 320
-    assert faults(browser) == []
-    browser.picture(f"phone-list-{scheme}")
+    look(browser, "phone-list")
     named = "[...document.querySelectorAll('button, select, input, a')]"
     nameless = f"{named}.filter((e) => e.checkVisibility()).filter((e) =>"
     nameless += " !(e.textContent.trim() || e.ariaLabel || e.labels?.length)).length"
     assert browser.js(nameless) == 0
     assert browser.failures() == []
-
-
-LAYOUT = """
-(async () => {
-  const { layOut } = await import("/page/layers.js");
-  const wrong = [];
-  let seed = 7;
-  const random = (below) => (seed = (seed * 48271) % 2147483647) % below;
-  for (let round = 0; round < 200; round += 1) {
-    const count = 1 + random(12);
-    const nodes = Array.from({ length: count }, (_, at) =>
-      ({ id: `n${at}`, length: 60 + random(90), breadth: 40 + random(30) }));
-    const edges = Array.from({ length: random(20) }, () =>
-      ({ from: `n${random(count)}`, to: `n${random(count + 1)}` }));
-    const plan = layOut(nodes, edges, 50);
-    const places = [...plan.places.values()];
-    for (const a of places) {
-      if (!(a.along >= 0 && a.across >= 0 && a.along <= plan.length && a.across <= plan.breadth)) {
-        wrong.push([round, a.id, "outside"]);
-      }
-      for (const b of places) {
-        if (a.id < b.id && Math.abs(a.along - b.along) < (a.length + b.length) / 2 - 1 &&
-            Math.abs(a.across - b.across) < (a.breadth + b.breadth) / 2 - 1) {
-          wrong.push([round, a.id, b.id]);
-        }
-      }
-    }
-    for (const [edge, way] of plan.ways) {
-      if (way[0].id !== edge.from || way.at(-1).id !== edge.to) wrong.push([round, edge]);
-      const steps = way.slice(1).map((place, at) => place.layer - way[at].layer);
-      if (steps.some((step) => step !== (plan.back.has(edge) ? -1 : 1))) wrong.push([round, "way"]);
-    }
-  }
-  return wrong;
-})()
-"""
-
-
-def test_no_two_nodes_in_one_place(browser: Browser) -> None:
-    """Two hundred graphs, with circles, loops and edges from nowhere."""
-    assert browser.js(LAYOUT) == []
-
-
-KEPT = """
-(async () => {
-  const { Graph } = await import("/page/graph.js");
-  const graph = new Graph(() => 0);
-  document.body.append(graph.node);
-  const box = () => graph.node.querySelector("[data-node=a]");
-  const show = (...ids) => graph.show({ nodes: ids.map((id) => ({ id, kind: "python" })) });
-  show("a");
-  const first = box();
-  show("a");
-  const isKept = box() === first;
-  show("a", "b");
-  return [isKept, box() !== first, graph.boxes.size];
-})()
-"""
-
-
-def test_the_same_graph_keeps_its_boxes(browser: Browser) -> None:
-    """A mouse button goes down and up over the same box."""
-    assert browser.js(KEPT) == [True, True, 2]

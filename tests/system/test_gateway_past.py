@@ -16,7 +16,7 @@ from dora_systemd.scope import Scope
 from tests.system.cells import TICK, Cell, Project, journalctl, sync_journal, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
-from tests.system.pages import CONTRAST, faults, node
+from tests.system.pages import CONTRAST, SCHEMES, faults, node
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
 
@@ -74,12 +74,10 @@ def marks(browser: Browser, word: str) -> list[str]:
     return [str(one) for one in browser.js(THINGS) if word in one]
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.warns(*KILLED)
 def test_what_happened_before_the_page_was_opened(
-    scheme: str, browser: Browser, shaky: Cell, front: Front
+    browser: Browser, shaky: Cell, front: Front
 ) -> None:
-    browser.prefer(scheme)
     browser.open(f"http://127.0.0.1:{front.port}/?later#{shaky.status.uuid}")
     browser.wait_js(f"{THINGS}.some((one) => one.includes('crashed'))")
     assert marks(browser, "Running, from"), "the life"
@@ -97,18 +95,20 @@ def test_what_happened_before_the_page_was_opened(
     browser.wait_text(".past .chosen", "SIGKILL")
     browser.wait_text(f"{node('shaky')} .facts", "PID ")
     browser.wait_text(f"{node('shaky')} .facts", "1 restart of 3")
-    look(browser, f"timeline-{scheme}")
+    look(browser, "timeline")
     browser.resize(*PHONE, is_phone=True)
     browser.wait_js("document.documentElement.scrollWidth === 320")
-    look(browser, f"timeline-phone-{scheme}")
+    look(browser, "timeline-phone")
     assert browser.failures() == []
 
 
 def look(browser: Browser, name: str) -> None:
-    """A picture, on which everybody can read everything."""
-    assert browser.js(CONTRAST) == []
-    assert faults(browser) == []
-    browser.picture(name, is_whole=True)
+    """Pictures, on which everybody can read everything."""
+    for scheme in SCHEMES:
+        browser.prefer(scheme)
+        assert browser.js(CONTRAST) == [], scheme
+        assert faults(browser) == [], scheme
+        browser.picture(f"{name}-{scheme}", is_whole=True)
 
 
 def test_what_a_node_forges_is_bounded_text(
@@ -129,23 +129,6 @@ def test_what_a_node_forges_is_bounded_text(
     assert marks(browser, "<img src=x onerror=alert(1)>red")
     assert browser.js("document.querySelectorAll('.past img').length") == 0
     assert browser.failures() == []
-
-
-TIMES = """
-import('/page/words.js').then(({ since, zoneWords, local }) =>
-  [since(1795767615e6), zoneWords(), local(1795767615e6)])
-"""
-
-
-def test_times_are_local_with_utc_beside_them(browser: Browser) -> None:
-    browser.call("Emulation.setTimezoneOverride", timezoneId="Asia/Kolkata")
-    text, zone, field = browser.js(TIMES)
-    assert "13:50:15" in text
-    assert "(08:20:15 UTC), " in text
-    assert (zone, field) == ("times in UTC+05:30", "2026-11-27T13:50:15")
-    browser.call("Emulation.setTimezoneOverride", timezoneId="UTC")
-    text, zone, field = browser.js(TIMES)
-    assert ("(" in text, zone, field) == (False, "times in UTC", "2026-11-27T08:20:15")
 
 
 @pytest.mark.warns(*KILLED)
@@ -205,78 +188,3 @@ def test_bundles_are_listed_and_downloaded(
     finally:
         shutil.rmtree(STORE / cell.name, ignore_errors=True)
     assert browser.failures() == []
-
-
-FILTERED = """
-import('/page/cards.js').then(({ Filter }) => {
-  const filter = new Filter(() => 0);
-  const flows = [
-    { name: 'arm', status: 'Running', nodes: [{ node: 'camera' }] },
-    { name: 'base', status: 'Failed', nodes: [] },
-  ];
-  return ['', 'CAM', 'fail', 'arm run', 'arm fail'].map((text) => {
-    filter.text.value = text;
-    filter.show(6, 1);
-    return [filter.of(flows).map(({ name }) => name).join(), filter.text.checkVisibility()];
-  });
-})
-"""
-WAITS = """
-import('/page/waits.js').then(({ Waits }) => {
-  let count = 0;
-  const waits = new Waits(() => { count += 1; });
-  const history = (cpu) => ({ of: () => ({ waits: { cpu, io: 7 } }) });
-  waits.show({ uuid: 'u', nodes: [] }, history(12));
-  const few = [waits.node.textContent, count];
-  waits.show({ uuid: 'u', nodes: [] }, history(40));
-  waits.show({ uuid: 'u', nodes: [] }, history(40));
-  waits.take({ waits: ['<b>a</b> waited 40%'], remedies: ['move it'] });
-  return [...few, count, waits.node.textContent, waits.node.querySelectorAll('b').length];
-})
-"""
-ACTIONS = """
-import('/page/why.js').then(({ Why }) => {
-  const asked = [];
-  const why = new Why(() => 0, (action) => asked.push(action));
-  const remedies = REMEDIES;
-  why.show({ why: {
-    name: 'robot', status: 'Failed', summary: 'x', node: '', last_lines: [], timeline: [], remedies,
-    starved: [], restart_history: [], details: {}, at_us: 1,
-  } });
-  for (const one of why.node.querySelectorAll('[data-action]')) one.click();
-  return asked;
-})
-"""
-
-
-def test_many_are_filtered(browser: Browser) -> None:
-    assert browser.js(FILTERED) == [
-        ["arm,base", True],
-        ["arm", True],
-        ["base", True],
-        ["arm", True],
-        ["", True],
-    ]
-
-
-def test_waits_are_explained(browser: Browser) -> None:
-    text, count, more, long, marked = browser.js(WAITS)
-    assert "waited for a CPU 12\xa0% of the time, for a disk 7\xa0%" in text
-    assert (count, more) == (0, 1), "the gateway is asked once, and only for long waits"
-    assert "<b>a</b> waited 40%move it" in long
-    assert marked == 0
-
-
-@pytest.mark.parametrize(
-    ("remedies", "actions"),
-    [
-        ([], []),
-        (["fix a, then run: doractl restart robot"], ["start"]),
-        (["fix a, then run: doractl start /srv/robot/dataflow.yml --name robot"], ["start"]),
-        (["doractl rollback robot; or doractl stop robot does"], ["rollback", "stop"]),
-        (["doractl logs robot --node a", "doractl restart other"], []),
-        (["doractl reload robot --node a"], []),
-    ],
-)
-def test_remedies_are_buttons(browser: Browser, remedies: list[str], actions: list[str]) -> None:
-    assert browser.js(ACTIONS.replace("REMEDIES", json.dumps(remedies))) == actions

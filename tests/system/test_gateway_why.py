@@ -8,7 +8,7 @@ import pytest
 from tests.system.cells import THREE_NODES, TICK, Cell, Project, sync_journal, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
-from tests.system.pages import CONTRAST, CUT, box, faults, node
+from tests.system.pages import CONTRAST, CUT, SCHEMES, box, faults, node
 from tests.system.test_why import CRASHES, TAKER, bad, failed
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
@@ -30,7 +30,6 @@ SAVED = """
 })()
 """
 """Keeps what is downloaded, for a look at it."""
-SCHEMES = pytest.mark.parametrize("scheme", ["light", "dark"])
 CARDS = "[...document.querySelectorAll('#list .card strong')].map((e) => e.textContent)"
 
 
@@ -43,24 +42,25 @@ def degraded(cell: Cell, project: Project) -> None:
     wait_for("it is degraded", lambda: cell.status.stage == "degraded")
 
 
-def look(browser: Browser, name: str, scheme: str) -> None:
+def look(browser: Browser, name: str) -> None:
     """Pictures on a desktop and on a telephone, where everything is to be read as well."""
-    browser.prefer(scheme)
-    browser.wait_js("document.querySelectorAll('.graph .box').length > 1")
-    assert browser.js(CONTRAST) == []
-    assert faults(browser) == []
-    browser.picture(f"{name}-{scheme}", is_whole=True)
-    browser.resize(320, 740, is_phone=True)
-    browser.wait_js("document.documentElement.scrollWidth === 320")
-    assert browser.js(CONTRAST) == []
-    assert browser.js(CUT) == []
-    assert faults(browser) == []
-    browser.picture(f"{name}-phone-{scheme}", is_whole=True)
+    for scheme in SCHEMES:
+        browser.prefer(scheme)
+        browser.resize(1280, 900)
+        browser.wait_js("document.querySelectorAll('.graph .box').length > 1")
+        assert browser.js(CONTRAST) == [], scheme
+        assert faults(browser) == [], scheme
+        browser.picture(f"{name}-{scheme}", is_whole=True)
+        browser.resize(320, 740, is_phone=True)
+        browser.wait_js("document.documentElement.scrollWidth === 320")
+        assert browser.js(CONTRAST) == [], scheme
+        assert browser.js(CUT) == [], scheme
+        assert faults(browser) == [], scheme
+        browser.picture(f"{name}-phone-{scheme}", is_whole=True)
 
 
-@SCHEMES
 @pytest.mark.warns(*CRASHES)
-def test_one_that_failed(scheme: str, browser: Browser, cell: Cell, project: Project) -> None:
+def test_one_that_failed(browser: Browser, cell: Cell, project: Project) -> None:
     cell.start(bad(project), check=False)
     failed(cell)
     browser.wait_text("#detail .badge", "Failed")
@@ -82,13 +82,12 @@ def test_one_that_failed(scheme: str, browser: Browser, cell: Cell, project: Pro
     assert not browser.js("document.querySelector('#detail .charts .chart').checkVisibility()")
     browser.wait_text("#totals", "1 failed")
     assert "1 dataflow" in browser.text("#totals"), "it has a card"
-    look(browser, "failed", scheme)
+    look(browser, "failed")
     assert browser.failures() == []
 
 
-@SCHEMES
 @pytest.mark.warns(*CRASHES, "node_failure", "Degraded")
-def test_one_that_is_degraded(scheme: str, browser: Browser, cell: Cell, project: Project) -> None:
+def test_one_that_is_degraded(browser: Browser, cell: Cell, project: Project) -> None:
     degraded(cell, project)
     browser.wait_text("#detail .badge", "Degraded")
     browser.wait_text("#detail .why h2", "Why it is degraded")
@@ -109,12 +108,11 @@ def test_one_that_is_degraded(scheme: str, browser: Browser, cell: Cell, project
     # The same node again: all of them.
     browser.click(box(LONG))
     browser.wait_text(".lines", "got [")
-    look(browser, "degraded", scheme)
+    look(browser, "degraded")
     assert browser.failures() == []
 
 
-@SCHEMES
-def test_one_that_runs(scheme: str, browser: Browser, cell: Cell, project: Project) -> None:
+def test_one_that_runs(browser: Browser, cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     browser.wait_text("#detail .badge", "Running")
     browser.wait_text("#detail dl", "Sandbox")
@@ -123,7 +121,7 @@ def test_one_that_runs(scheme: str, browser: Browser, cell: Cell, project: Proje
         assert words in facts, facts
     browser.wait_text(".lines", "got [")
     assert browser.js("document.querySelector('#detail .why').hidden")
-    look(browser, "running", scheme)
+    look(browser, "running")
     assert browser.failures() == []
 
 

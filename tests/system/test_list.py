@@ -41,60 +41,6 @@ def test_what_failed_comes_first_with_its_reason(cell: Cell, project: Project) -
     assert cell.doractl("restart", check=False).stderr.endswith(hint)
 
 
-def test_table(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    header, row = cell.doractl("list").stdout.splitlines()
-    assert header.split() == [
-        "UUID",
-        "NAME",
-        "STATUS",
-        "UPTIME",
-        "NODES",
-        "CPU%",
-        "MEM",
-        "RESTARTS",
-        "BOOT",
-    ]
-    fields = row.split()
-    assert fields[0] in cell.show("ExecStart")
-    assert len(fields[0]) == 8
-    assert fields[1:3] == [cell.name, "Running"]
-    assert re.fullmatch(r"00:00:\d\d", fields[3])
-    assert fields[4] == "3/3"
-    assert float(fields[5]) > 0
-    assert fields[6].endswith("M")
-    assert fields[7:] == ["0", "-"]
-
-
-def test_one_dataflow(cell: Cell, project: Project) -> None:
-    flow = project.three_nodes()
-    cell.start(flow)
-    shown = cell.doractl("list", cell.name).stdout
-    for part in (f"Unit:     {cell.unit}", f"File:     {flow}", "Status:   Running (3/3 nodes"):
-        assert part in shown
-    row = json.loads(cell.doractl("status", cell.name, "-o", "json").stdout)
-    nodes = {node["node"]: node for node in row["nodes"]}
-    assert list(nodes) == ["source", "doubler", "sink"]
-    for name, node in nodes.items():
-        assert cell.pids(f"node-{name}") == [node["pid"]]
-        assert node["memory_bytes"] > 1 << 20
-        assert node["state"] == "running"
-
-
-def test_selectors(cell: Cell, project: Project) -> None:
-    uuid = json.loads(cell.start(project.three_nodes(), "-o", "json").stdout)["uuid"]
-    for selector in (cell.name, cell.unit, uuid, uuid[:8], uuid.upper()):
-        assert f"Dataflow: {uuid}" in cell.doractl("list", selector).stdout
-
-
-def test_a_pattern(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    (row,) = json.loads(cell.doractl("list", f"{cell.name[:-1]}*", "-o", "json").stdout)
-    assert row["uuid"]
-    done = cell.doractl("list", f"{cell.name}x*", check=False)
-    assert done.returncode == ExitCode.NOT_FOUND
-
-
 def test_it_needs_nothing_of_ours_alive(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     pids = list(cell.all_pids())
@@ -105,16 +51,6 @@ def test_it_needs_nothing_of_ours_alive(cell: Cell, project: Project) -> None:
     finally:
         for pid in pids:
             os.kill(pid, signal.SIGCONT)
-
-
-@pytest.mark.lab
-def test_without_the_node_table(cell: Cell, project: Project) -> None:
-    """What another user sees: the directory of the cell is closed."""
-    cell.start(project.three_nodes())
-    command = ("su", "bob", "-s", "/bin/sh", "-c", "exec doractl --system list -o json")
-    (row,) = json.loads(run(*command).stdout)
-    assert (row["name"], row["nodes_alive"], row["nodes_total"]) == (cell.name, 3, 3)
-    assert row["memory_bytes"] > 1 << 20
 
 
 @pytest.mark.warns(
@@ -238,13 +174,6 @@ def test_restarts_have_one_meaning(cell: Cell, project: Project) -> None:
     assert "Restarts: bad 1 (exit code 3)\n" in cell.doractl("why", cell.name).stdout
 
 
-def test_unknown_selector(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    done = cell.doractl("list", cell.name[:-1], check=False)
-    assert done.returncode == ExitCode.NOT_FOUND
-    assert f"did you mean {cell.name}" in done.stderr
-
-
 @pytest.mark.lab
 def test_a_user_has_dataflows_of_his_own(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
@@ -263,3 +192,67 @@ def test_a_user_has_dataflows_of_his_own(cell: Cell, project: Project) -> None:
         assert re.fullmatch(rf"No dataflow is running\.\n{other}\n", done.stdout), done.stdout
     finally:
         as_alice("stop", "--all")
+
+
+class TestWhatRuns:
+    """All of them look at the same dataflow."""
+
+    def test_table(self, running: Cell) -> None:
+        header, row = running.doractl("list").stdout.splitlines()
+        assert header.split() == [
+            "UUID",
+            "NAME",
+            "STATUS",
+            "UPTIME",
+            "NODES",
+            "CPU%",
+            "MEM",
+            "RESTARTS",
+            "BOOT",
+        ]
+        fields = row.split()
+        assert fields[0] in running.show("ExecStart")
+        assert len(fields[0]) == 8
+        assert fields[1:3] == [running.name, "Running"]
+        assert re.fullmatch(r"00:00:\d\d", fields[3])
+        assert fields[4] == "3/3"
+        assert float(fields[5]) > 0
+        assert fields[6].endswith("M")
+        assert fields[7:] == ["0", "-"]
+
+    def test_one_dataflow(self, running: Cell, class_project: Project) -> None:
+        shown = running.doractl("list", running.name).stdout
+        flow = class_project.root / "dataflow.yml"
+        for part in (f"Unit:     {running.unit}", f"File:     {flow}", "Status:   Running (3/3 no"):
+            assert part in shown
+        row = json.loads(running.doractl("status", running.name, "-o", "json").stdout)
+        nodes = {node["node"]: node for node in row["nodes"]}
+        assert list(nodes) == ["source", "doubler", "sink"]
+        for name, node in nodes.items():
+            assert running.pids(f"node-{name}") == [node["pid"]]
+            assert node["memory_bytes"] > 1 << 20
+            assert node["state"] == "running"
+
+    def test_selectors(self, running: Cell) -> None:
+        uuid = running.status.uuid
+        for selector in (running.name, running.unit, uuid, uuid[:8], uuid.upper()):
+            assert f"Dataflow: {uuid}" in running.doractl("list", selector).stdout
+
+    def test_a_pattern(self, running: Cell) -> None:
+        (row,) = json.loads(running.doractl("list", f"{running.name[:-1]}*", "-o", "json").stdout)
+        assert row["uuid"]
+        done = running.doractl("list", f"{running.name}x*", check=False)
+        assert done.returncode == ExitCode.NOT_FOUND
+
+    @pytest.mark.lab
+    def test_without_the_node_table(self, running: Cell) -> None:
+        """What another user sees: the directory of the cell is closed."""
+        command = ("su", "bob", "-s", "/bin/sh", "-c", "exec doractl --system list -o json")
+        (row,) = json.loads(run(*command).stdout)
+        assert (row["name"], row["nodes_alive"], row["nodes_total"]) == (running.name, 3, 3)
+        assert row["memory_bytes"] > 1 << 20
+
+    def test_unknown_selector(self, running: Cell) -> None:
+        done = running.doractl("list", running.name[:-1], check=False)
+        assert done.returncode == ExitCode.NOT_FOUND
+        assert f"did you mean {running.name}" in done.stderr

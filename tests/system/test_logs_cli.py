@@ -4,7 +4,6 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -38,14 +37,24 @@ pytestmark = pytest.mark.warns("a bad thing")
 UUID = "12345678-e29b-41d4-a716-446655440000"
 
 
-@pytest.fixture
-def talking(cell: Cell, project: Project) -> Iterator[Cell]:
+def start_talking(cell: Cell, project: Project) -> Cell:
     project.write("talk.py", TALK)
     cell.start(project.write("dataflow.yml", FLOW))
     for node in ("cam-left", "cam-right"):
         wait_for("ticks", lambda node=node: "tick" in cell.messages(node))  # type: ignore[misc]
     sync_journal()
-    yield cell
+    return cell
+
+
+@pytest.fixture
+def talking(cell: Cell, project: Project) -> Cell:
+    return start_talking(cell, project)
+
+
+@pytest.fixture(scope="class")
+def talks(class_cell: Cell, class_project: Project) -> Cell:
+    """The same for tests that end and restart nothing."""
+    return start_talking(class_cell, class_project)
 
 
 def logs(cell: Cell, *arguments: str, check: bool = True) -> list[str]:
@@ -54,76 +63,6 @@ def logs(cell: Cell, *arguments: str, check: bool = True) -> list[str]:
 
 def messages(cell: Cell, *arguments: str) -> list[str]:
     return logs(cell, cell.name, "-o", "cat", *arguments)
-
-
-def test_what_is_shown(talking: Cell) -> None:
-    left = messages(talking, "--node", "cam-left")
-    assert [line for line in left if line.startswith("line")] == [f"line {i}" for i in range(5)]
-    both = messages(talking, "--node", "cam-*", "--grep", "^line 3$")
-    assert both == ["line 3", "line 3"]
-    assert "a bad thing" in messages(talking, "--level", "error")
-    assert "on stderr" not in messages(talking, "--level", "warn")
-    assert "a detail" in messages(talking, "--level", "debug")
-    assert "a tiny detail" not in messages(talking, "--level", "debug")
-    assert "a tiny detail" in messages(talking, "--level", "trace")
-    assert len(messages(talking, "--tail", "3")) == 3
-    assert messages(talking, "--since", "1h")
-    assert not messages(talking, "--until", "1 hour ago")
-    first, *_, last = messages(talking, "--events")
-    assert first == f"Dataflow {talking.name} is starting"
-    assert last == f"Dataflow {talking.name} is running, all nodes are ready"
-    assert messages(talking, "--events", "--reverse")[-1] == first
-
-
-def test_a_full_disk_is_an_error(talking: Cell) -> None:
-    done = run("sh", "-c", f"doractl logs {talking.name} >/dev/full", check=False)
-    assert done.returncode == ExitCode.FAILURE
-    assert done.stderr == "doractl: cannot write output: No space left on device\n"
-
-
-def test_letters_mean_what_they_mean_in_journalctl(talking: Cell) -> None:
-    assert len(messages(talking, "-n", "3")) == len(messages(talking, "--lines=3")) == 3
-    assert len(messages(talking, "-n", "all")) > 10
-    everything = messages(talking, "--events")
-    assert messages(talking, "--events", "-b") == messages(talking, "-b0", "--events") == everything
-    assert "No entries" in "".join(logs(talking, talking.name, "--until", "1h", check=False))
-    assert logs(talking, talking.name, "--until", "1h", "-q", check=False) == []
-
-
-def test_found_lines_come_oldest_first(talking: Cell) -> None:
-    lines = [f"line {i}" for i in range(5)]
-    words = ("--node", "cam-left", "--grep", "^line")
-    assert messages(talking, *words, "--tail", "3") == lines[-3:]
-    assert messages(talking, *words, "--tail", "3", "--reverse") == lines[:1:-1]
-    assert len(messages(talking, "--grep", "tick", "--tail", "2")) == 2
-
-
-def test_levels_of_single_nodes(talking: Cell) -> None:
-    words = ("--log-filter", "cam-left=debug, cam-right=error", "--grep", "detail|bad|stderr")
-    records = [json.loads(line) for line in logs(talking, talking.name, "-o", "json", *words)]
-    told = {(one["DORA_NODE"], one["MESSAGE"]) for one in records}
-    left = ("on stderr", "a bad thing", "a detail")
-    assert told == {*(("cam-left", text) for text in left), ("cam-right", "a bad thing")}
-    started = ("--log-filter", "cam-left=error", "--grep", "all nodes are ready")
-    assert len(messages(talking, *started)) == 1
-    assert set(messages(talking, "--level", "stdout")) >= {"a tiny detail", "line 0", "on stderr"}
-
-
-def test_several_dataflows(talking: Cell, project: Project) -> None:
-    other = Cell(f"{talking.name}-b", talking.scope)
-    try:
-        other.start(Project(project.root / "other").three_nodes())
-        sync_journal()
-        starting = [f"Dataflow {cell.name} is starting" for cell in (talking, other)]
-        for selectors in ((talking.name, other.name), (f"{talking.name}*",)):
-            found = logs(talking, *selectors, "-o", "cat", "--events", "--grep", "is starting")
-            assert found == starting
-        text = shown("doractl", talking.scope.flag, "logs", f"{talking.name}*", "--no-pager")
-        assert f"{talking.name}/cam-left" in text
-        done = talking.doractl("logs", talking.name, other.name, "--until-end", check=False)
-        assert done.stderr.startswith("doractl: cannot wait for the end of several dataflows")
-    finally:
-        other.end()
 
 
 def test_repetitions_on_a_terminal(talking: Cell) -> None:
@@ -210,37 +149,6 @@ def test_until_the_end_of_what_does_not_run(talking: Cell) -> None:
     assert messages(talking, "--until-end") == messages(talking, "--tail", "10")
 
 
-def test_terminal(talking: Cell) -> None:
-    """Aligned and coloured; the pager is not asked for."""
-    command = ["doractl", talking.scope.flag, "logs", talking.name, "--no-pager", "--tail", "40"]
-    lines = shown(*command).splitlines()
-    assert len(set(re.findall(r"(\x1b\[\d+m)cam", "\n".join(lines)))) == 2
-    plain = [re.sub(r"\x1b\[[0-9;:]*m", "", line) for line in lines]
-    places = {line.index("tick") for line in plain if line.endswith(" tick")}
-    assert len(places) == 1
-
-
-def test_pager(talking: Cell, tmp_path: Path) -> None:
-    seen = tmp_path / "seen"
-    words = ("--tail", "5", "--grep", "^line")
-    assert shown("doractl", "logs", talking.name, *words, PAGER=f"tee {seen}")
-    assert len(seen.read_text().splitlines()) == 5
-
-
-@pytest.mark.lab
-def test_forged_names_and_nodes_do_not_count(talking: Cell) -> None:
-    """Anybody can write records that look like those of dataflows; journald names their unit."""
-    fields = ("MESSAGE=x", f"DORA_DATAFLOW={UUID}", "DORA_NODE=forged")
-    own = (f"DORA_DATAFLOW_NAME={talking.name}x", f"SYSLOG_IDENTIFIER={talking.name}/forged")
-    send = "import sys; from dora_systemd.adapters.journal.note import send_note as send; "
-    send += "send('\\n'.join([*sys.argv[1:], '']).encode())"
-    run("runuser", "-u", "alice", "--", sys.executable, "-c", send, *fields, *own)
-    wait_for("it", lambda: journalctl("-o", "cat", f"DORA_DATAFLOW={UUID}"))
-    for words in ((f"{talking.name}x*",), (UUID[:8],), (talking.name, "--node", "forg*")):
-        done = talking.doractl("logs", *words, check=False)
-        assert done.returncode == ExitCode.NOT_FOUND, done.stdout
-
-
 BAD_INPUT = [
     (["{name}", "--node", "cam"], 4, "cannot find a node 'cam'", "cam-left, cam-right"),
     (["{name}x"], 4, "no dataflow named ", "did you mean"),
@@ -262,35 +170,6 @@ BAD_INPUT = [
 ]
 
 
-def test_bad_input(talking: Cell) -> None:
-    for arguments, code, problem, hint in BAD_INPUT:
-        words = [word.format(name=talking.name) for word in arguments]
-        done = talking.doractl("logs", *words, check=False)
-        assert (done.returncode, done.stdout) == (code, "")
-        first, *rest = done.stderr.splitlines()
-        assert first.startswith(f"doractl: {problem}")
-        assert len(rest) <= 1
-        assert hint in done.stderr
-
-
-@pytest.mark.lab
-def test_journal_unreadable(talking: Cell) -> None:
-    words = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
-    done = run(*words, "doractl", "--system", "logs", talking.name, check=False)
-    assert done.returncode == 8
-    assert "cannot read the system's journal" in done.stderr
-    assert "systemd-journal" in done.stderr
-
-
-def test_no_entries(talking: Cell) -> None:
-    done = talking.doractl("logs", talking.name, "--grep", "never said", check=False)
-    assert "No entries" in done.stdout
-    assert not done.stderr
-    names = {record["DORA_EVENT"] for record in talking.journal() if "DORA_EVENT" in record}
-    assert names
-    assert names <= set(EVENTS)
-
-
 @pytest.mark.lab
 @pytest.mark.parametrize("scope", ["--system", "--user"])
 def test_a_journal_in_memory_that_is_closed(scope: str) -> None:
@@ -307,3 +186,125 @@ def test_a_journal_in_memory_that_is_closed(scope: str) -> None:
     assert done.returncode == ExitCode.NO_PERMISSION
     assert done.stderr.startswith("doractl: cannot read the ")
     assert "systemd-journal" in done.stderr
+
+
+class TestWhatIsShown:
+    """All of them read the lines of the same dataflow."""
+
+    def test_what_is_shown(self, talks: Cell) -> None:
+        left = messages(talks, "--node", "cam-left")
+        assert [line for line in left if line.startswith("line")] == [f"line {i}" for i in range(5)]
+        both = messages(talks, "--node", "cam-*", "--grep", "^line 3$")
+        assert both == ["line 3", "line 3"]
+        assert "a bad thing" in messages(talks, "--level", "error")
+        assert "on stderr" not in messages(talks, "--level", "warn")
+        assert "a detail" in messages(talks, "--level", "debug")
+        assert "a tiny detail" not in messages(talks, "--level", "debug")
+        assert "a tiny detail" in messages(talks, "--level", "trace")
+        assert len(messages(talks, "--tail", "3")) == 3
+        assert messages(talks, "--since", "1h")
+        assert not messages(talks, "--until", "1 hour ago")
+        first, *_, last = messages(talks, "--events")
+        assert first == f"Dataflow {talks.name} is starting"
+        assert last == f"Dataflow {talks.name} is running, all nodes are ready"
+        assert messages(talks, "--events", "--reverse")[-1] == first
+
+    def test_a_full_disk_is_an_error(self, talks: Cell) -> None:
+        done = run("sh", "-c", f"doractl logs {talks.name} >/dev/full", check=False)
+        assert done.returncode == ExitCode.FAILURE
+        assert done.stderr == "doractl: cannot write output: No space left on device\n"
+
+    def test_letters_mean_what_they_mean_in_journalctl(self, talks: Cell) -> None:
+        assert len(messages(talks, "-n", "3")) == len(messages(talks, "--lines=3")) == 3
+        assert len(messages(talks, "-n", "all")) > 10
+        everything = messages(talks, "--events")
+        assert messages(talks, "--events", "-b") == messages(talks, "-b0", "--events") == everything
+        assert "No entries" in "".join(logs(talks, talks.name, "--until", "1h", check=False))
+        assert logs(talks, talks.name, "--until", "1h", "-q", check=False) == []
+
+    def test_found_lines_come_oldest_first(self, talks: Cell) -> None:
+        lines = [f"line {i}" for i in range(5)]
+        words = ("--node", "cam-left", "--grep", "^line")
+        assert messages(talks, *words, "--tail", "3") == lines[-3:]
+        assert messages(talks, *words, "--tail", "3", "--reverse") == lines[:1:-1]
+        assert len(messages(talks, "--grep", "tick", "--tail", "2")) == 2
+
+    def test_levels_of_single_nodes(self, talks: Cell) -> None:
+        words = ("--log-filter", "cam-left=debug, cam-right=error", "--grep", "detail|bad|stderr")
+        records = [json.loads(line) for line in logs(talks, talks.name, "-o", "json", *words)]
+        told = {(one["DORA_NODE"], one["MESSAGE"]) for one in records}
+        left = ("on stderr", "a bad thing", "a detail")
+        assert told == {*(("cam-left", text) for text in left), ("cam-right", "a bad thing")}
+        started = ("--log-filter", "cam-left=error", "--grep", "all nodes are ready")
+        assert len(messages(talks, *started)) == 1
+        assert set(messages(talks, "--level", "stdout")) >= {"a tiny detail", "line 0", "on stderr"}
+
+    def test_several_dataflows(self, talks: Cell, class_project: Project) -> None:
+        other = Cell(f"{talks.name}-b", talks.scope)
+        try:
+            other.start(Project(class_project.root / "other").three_nodes())
+            sync_journal()
+            starting = [f"Dataflow {cell.name} is starting" for cell in (talks, other)]
+            for selectors in ((talks.name, other.name), (f"{talks.name}*",)):
+                found = logs(talks, *selectors, "-o", "cat", "--events", "--grep", "is starting")
+                assert found == starting
+            text = shown("doractl", talks.scope.flag, "logs", f"{talks.name}*", "--no-pager")
+            assert f"{talks.name}/cam-left" in text
+            done = talks.doractl("logs", talks.name, other.name, "--until-end", check=False)
+            assert done.stderr.startswith("doractl: cannot wait for the end of several dataflows")
+        finally:
+            other.end()
+
+    def test_terminal(self, talks: Cell) -> None:
+        """Aligned and coloured; the pager is not asked for."""
+        command = ["doractl", talks.scope.flag, "logs", talks.name, "--no-pager", "--tail", "40"]
+        lines = shown(*command).splitlines()
+        assert len(set(re.findall(r"(\x1b\[\d+m)cam", "\n".join(lines)))) == 2
+        plain = [re.sub(r"\x1b\[[0-9;:]*m", "", line) for line in lines]
+        places = {line.index("tick") for line in plain if line.endswith(" tick")}
+        assert len(places) == 1
+
+    def test_pager(self, talks: Cell, tmp_path: Path) -> None:
+        seen = tmp_path / "seen"
+        words = ("--tail", "5", "--grep", "^line")
+        assert shown("doractl", "logs", talks.name, *words, PAGER=f"tee {seen}")
+        assert len(seen.read_text().splitlines()) == 5
+
+    def test_bad_input(self, talks: Cell) -> None:
+        for arguments, code, problem, hint in BAD_INPUT:
+            words = [word.format(name=talks.name) for word in arguments]
+            done = talks.doractl("logs", *words, check=False)
+            assert (done.returncode, done.stdout) == (code, "")
+            first, *rest = done.stderr.splitlines()
+            assert first.startswith(f"doractl: {problem}")
+            assert len(rest) <= 1
+            assert hint in done.stderr
+
+    @pytest.mark.lab
+    def test_journal_unreadable(self, talks: Cell) -> None:
+        words = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
+        done = run(*words, "doractl", "--system", "logs", talks.name, check=False)
+        assert done.returncode == 8
+        assert "cannot read the system's journal" in done.stderr
+        assert "systemd-journal" in done.stderr
+
+    def test_no_entries(self, talks: Cell) -> None:
+        done = talks.doractl("logs", talks.name, "--grep", "never said", check=False)
+        assert "No entries" in done.stdout
+        assert not done.stderr
+        names = {record["DORA_EVENT"] for record in talks.journal() if "DORA_EVENT" in record}
+        assert names
+        assert names <= set(EVENTS)
+
+    @pytest.mark.lab
+    def test_forged_names_and_nodes_do_not_count(self, talks: Cell) -> None:
+        """Anybody can write such records; journald names the unit that has written one."""
+        fields = ("MESSAGE=x", f"DORA_DATAFLOW={UUID}", "DORA_NODE=forged")
+        own = (f"DORA_DATAFLOW_NAME={talks.name}x", f"SYSLOG_IDENTIFIER={talks.name}/forged")
+        send = "import sys; from dora_systemd.adapters.journal.note import send_note as send; "
+        send += "send('\\n'.join([*sys.argv[1:], '']).encode())"
+        run("runuser", "-u", "alice", "--", sys.executable, "-c", send, *fields, *own)
+        wait_for("it", lambda: journalctl("-o", "cat", f"DORA_DATAFLOW={UUID}"))
+        for words in ((f"{talks.name}x*",), (UUID[:8],), (talks.name, "--node", "forg*")):
+            done = talks.doractl("logs", *words, check=False)
+            assert done.returncode == ExitCode.NOT_FOUND, done.stdout

@@ -163,34 +163,6 @@ def test_a_stopped_node_that_others_read_comes_back_to_them(cell: Cell, project:
     assert time.monotonic() - begin < bound(8)
 
 
-def test_unknown_node(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    done = cell.doractl("node", "stop", cell.name, "sinc", check=False)
-    assert done.returncode == ExitCode.NOT_FOUND
-    assert "did you mean sink" in done.stderr
-
-
-@pytest.mark.lab
-def test_others_cannot_speak_to_the_coordinator(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    for words in ("node stop NAME sink", "dora NAME -- node list"):
-        command = f"exec doractl --system {words.replace('NAME', cell.name)}"
-        done = run("su", "bob", "-s", "/bin/sh", "-c", command, check=False)
-        assert done.returncode == ExitCode.NO_PERMISSION, done.stderr
-        assert len(done.stderr.splitlines()) == 2
-    assert len(cell.pids("node-sink")) == 1
-
-
-@pytest.mark.lab
-def test_others_cannot_stop_it(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    command = f"exec doractl --system stop {cell.name}"
-    done = run("su", "bob", "-s", "/bin/sh", "-c", command, check=False)
-    assert done.returncode == ExitCode.NO_PERMISSION
-    assert "sudo" in done.stderr
-    assert cell.show("ActiveState") == "active"
-
-
 def test_stock_dora(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes(), "--debug")
     shown = cell.doractl("dora", cell.name, "--", "node", "list").stdout
@@ -201,14 +173,6 @@ def test_stock_dora(cell: Cell, project: Project) -> None:
     assert "number" in done.stdout
 
 
-def test_show_is_what_systemctl_cat_prints(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    shown = cell.doractl("show", cell.name).stdout
-    assert shown.strip() == cell.systemctl("cat", "--no-pager").strip()
-    files = json.loads(cell.doractl("show", cell.name, "-o", "json").stdout)["files"]
-    assert [Path(path).name for path in files] == [cell.unit]
-
-
 # A node that knows no dora ends of SIGTERM, and the daemon says so if it is still there.
 @pytest.mark.warns("failed to receive reply from daemon", "Signal(15)")
 def test_verbs_that_need_a_running_dataflow(cell: Cell, project: Project) -> None:
@@ -217,3 +181,35 @@ def test_verbs_that_need_a_running_dataflow(cell: Cell, project: Project) -> Non
     cell.doractl("stop", cell.name)
     for words in (["show", cell.name], ["dora", cell.name, "--", "list"]):
         assert cell.doractl(*words, check=False).returncode == ExitCode.NOT_RUNNING
+
+
+class TestWhatRuns:
+    """All of them look at the same dataflow."""
+
+    def test_unknown_node(self, running: Cell) -> None:
+        done = running.doractl("node", "stop", running.name, "sinc", check=False)
+        assert done.returncode == ExitCode.NOT_FOUND
+        assert "did you mean sink" in done.stderr
+
+    @pytest.mark.lab
+    def test_others_cannot_speak_to_the_coordinator(self, running: Cell) -> None:
+        for words in ("node stop NAME sink", "dora NAME -- node list"):
+            command = f"exec doractl --system {words.replace('NAME', running.name)}"
+            done = run("su", "bob", "-s", "/bin/sh", "-c", command, check=False)
+            assert done.returncode == ExitCode.NO_PERMISSION, done.stderr
+            assert len(done.stderr.splitlines()) == 2
+        assert len(running.pids("node-sink")) == 1
+
+    @pytest.mark.lab
+    def test_others_cannot_stop_it(self, running: Cell) -> None:
+        command = f"exec doractl --system stop {running.name}"
+        done = run("su", "bob", "-s", "/bin/sh", "-c", command, check=False)
+        assert done.returncode == ExitCode.NO_PERMISSION
+        assert "sudo" in done.stderr
+        assert running.show("ActiveState") == "active"
+
+    def test_show_is_what_systemctl_cat_prints(self, running: Cell) -> None:
+        shown = running.doractl("show", running.name).stdout
+        assert shown.strip() == running.systemctl("cat", "--no-pager").strip()
+        files = json.loads(running.doractl("show", running.name, "-o", "json").stdout)["files"]
+        assert [Path(path).name for path in files] == [running.unit]
