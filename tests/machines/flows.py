@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tests.machines.journals import quiet_journals
-from tests.machines.wires import there
+from tests.machines.wires import bring, there
 from tests.system.cells import DOUBLER, SINK, SOURCE, Cell, Project, dora_processes, run, wait_for
 
 PLACE = "/opt/flow"
@@ -65,9 +65,7 @@ class Flow:
         """The same files on all machines."""
         self.write()
         for machine in self.members.values():
-            there(machine, f"rm -rf {PLACE}; mkdir -p {PLACE}")
-            command = ["scp", "-q", "-r", PLACE, f"root@{machine}:/opt"]
-            subprocess.run(command, check=True)
+            bring(machine, Path(PLACE))
 
     def flags(self) -> list[str]:
         """For `doractl start`."""

@@ -52,6 +52,7 @@ def test_a_life(flow: Flow) -> None:
     assert not flow.left()
 
 
+@pytest.mark.parametrize("flow", [THREE], indirect=True)
 def test_again_and_a_restart(flow: Flow) -> None:
     flow.start()
     life = flow.life()

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from tests.lab.pace import bound
-from tests.machines.flows import GRACE, NAME, TWO, Flow
+from tests.machines.flows import GRACE, NAME, THREE, TWO, Flow
 from tests.machines.journals import killed, lost
 from tests.machines.wires import cable, power_cut, there
 from tests.system.cells import run, wait_for
@@ -40,7 +40,7 @@ def test_a_short_break_is_only_a_gap(flow: Flow) -> None:
 
 
 @lost
-@pytest.mark.parametrize("how", ["off", "mute"])
+@pytest.mark.parametrize(("flow", "how"), [(THREE, "off"), (TWO, "mute")], indirect=["flow"])
 def test_a_cable_is_out(flow: Flow, how: str) -> None:
     """Both sides end within seconds, and it runs again soon after; no restart is counted."""
     life = flow.life()
@@ -59,6 +59,7 @@ def test_a_cable_is_out(flow: Flow, how: str) -> None:
 
 
 @lost
+@pytest.mark.parametrize("flow", [TWO], indirect=True)
 def test_a_stop_while_a_machine_is_away(flow: Flow) -> None:
     with cable("b", "mute"):
         begun = time.monotonic()
@@ -80,6 +81,7 @@ def test_a_machine_boots_again(flow: Flow) -> None:
 
 
 @lost
+@pytest.mark.parametrize("flow", [TWO], indirect=True)
 def test_a_machine_that_shuts_down_has_not_stopped_it(flow: Flow) -> None:
     """systemd stops everything there; that is no request to stop this dataflow."""
     life = flow.life()

@@ -5,7 +5,7 @@ After each: it runs again or says what it waits for, and no process is left wher
 
 import pytest
 
-from tests.machines.flows import NAME, Flow
+from tests.machines.flows import NAME, THREE, TWO, Flow
 from tests.machines.journals import killed, lost
 from tests.machines.wires import there
 from tests.system.cells import run, wait_for
@@ -15,14 +15,15 @@ from tests.system.cells import run, wait_for
 @killed
 @pytest.mark.warns("SIGKILL", "b: systemd: dora-flow")
 @pytest.mark.parametrize(
-    ("machine", "pattern"),
+    ("flow", "machine", "pattern"),
     [
-        ("a", "dora_systemd.runner"),
-        ("a", "dora coordinator"),
-        ("a", "dora daemon"),
-        ("b", "dora_systemd.runner"),
-        ("b", "dora daemon"),
+        (TWO, "a", "dora_systemd.runner"),
+        (THREE, "a", "dora coordinator"),
+        (TWO, "a", "dora daemon"),
+        (THREE, "b", "dora_systemd.runner"),
+        (TWO, "b", "dora daemon"),
     ],
+    indirect=["flow"],
 )
 def test_a_process_is_killed(flow: Flow, machine: str, pattern: str) -> None:
     life = flow.life()
@@ -41,6 +42,7 @@ def test_a_daemon_hangs(flow: Flow) -> None:
 
 
 @pytest.mark.warns("Node doubler crashed: ", "Node doubler is being restarted", "Signal(9)")
+@pytest.mark.parametrize("flow", [TWO], indirect=True)
 def test_a_node_is_killed(flow: Flow) -> None:
     """dora restarts it there; the others run on."""
     life = flow.life()
@@ -70,16 +72,19 @@ def test_what_somebody_asks_for_is_no_crash(flow: Flow) -> None:
     assert events.count("Node doubler: restart requested by root (doractl node restart)") == 3
     assert "crashed" not in events
     assert "Node doubler exited: exit code 3" in events
-    if "arm" in flow.members:
-        flow.cell.doractl("node", "stop", NAME, "sink")
-        assert flow.table()["sink"]["stopped_by"] == "root (doractl node stop)"
-        again = flow.cell.doractl("node", "restart", NAME, "sink", check=False)
-        assert f"doractl restart {NAME} starts the whole dataflow" in again.stderr
+    flow.cell.doractl("node", "stop", NAME, "sink")
+    assert flow.table()["sink"]["stopped_by"] == "root (doractl node stop)"
+    again = flow.cell.doractl("node", "restart", NAME, "sink", check=False)
+    assert f"doractl restart {NAME} starts the whole dataflow" in again.stderr
 
 
 @lost
 @killed
-@pytest.mark.parametrize("what", ["link", "ssh", "relay", "sshd"])
+@pytest.mark.parametrize(
+    ("flow", "what"),
+    [(TWO, "link"), (THREE, "ssh"), (TWO, "relay"), (THREE, "sshd")],
+    indirect=["flow"],
+)
 def test_the_link_is_killed(flow: Flow, what: str) -> None:
     life = flow.life()
     unit = f"doralink-{NAME}:gpu.service"

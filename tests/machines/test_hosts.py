@@ -2,25 +2,36 @@
 
 import json
 import re
+import shutil
 import subprocess
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
-from tests.machines.wires import OTHERS, cable, clear, power_cut, there
-from tests.system.cells import run, wait_for
+from tests.machines.flows import PLACE
+from tests.machines.wires import OTHERS, bring, cable, clear, power_cut, there
+from tests.system.cells import Project, run, wait_for
 
-ROBOT = "/src/examples/robot/dataflow.yml"
-NUMPY = "--env=PYTHONPATH=/opt/numpy"
+
+@pytest.fixture(scope="module", autouse=True)
+def files() -> None:
+    """A dataflow of one machine."""
+    shutil.rmtree(PLACE, ignore_errors=True)
+    project = Project(Path(PLACE))
+    project.three_nodes()
+    for name in OTHERS:
+        bring(name, project.root)
 
 
 @pytest.fixture(autouse=True)
-def dataflows() -> Iterator[None]:
+def dataflows(files: None) -> Iterator[None]:
     """The same dataflow on both of the others, enabled on b."""
-    started = doractl("start", ROBOT, "--name", "robot", NUMPY, "-H", "b,c")
+    del files
+    started = doractl("start", f"{PLACE}/dataflow.yml", "--name", "robot", "-H", "b,c")
     assert started.returncode == 0, started.stderr
     assert doractl("enable", "robot", "-H", "b").returncode == 0
     yield

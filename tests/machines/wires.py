@@ -4,10 +4,12 @@ import socket
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 from tests.lab.pace import bound
 from tests.system.cells import run, wait_for
 
+HERE = "a"
 OTHERS = ("b", "c")
 
 
@@ -23,9 +25,22 @@ def ask(*words: str) -> None:
 
 
 def there(name: str, *command: str, user: str = "root") -> subprocess.CompletedProcess[str]:
-    """Run a command on a machine, whatever its result. 255: ssh could not."""
-    options = ("-oBatchMode=yes", "-oConnectTimeout=2")
-    return run("ssh", *options, f"{user}@{name}", *command, check=False)
+    """Run a command in a shell on a machine, whatever its result. 255: ssh could not."""
+    if (name, user) == (HERE, "root"):
+        return run("bash", "-c", " ".join(command), check=False)
+    return run(*_ssh(user, name), *command, check=False)
+
+
+def bring(name: str, place: Path) -> None:
+    """Put a directory in its place on another machine, instead of what is there."""
+    pack = ["tar", "--create", f"--directory={place.parent}", place.name]
+    files = subprocess.run(pack, stdout=subprocess.PIPE, check=True).stdout
+    unpack = f"rm -rf {place} && tar --extract --directory={place.parent}"
+    subprocess.run([*_ssh("root", name), unpack], input=files, check=True)
+
+
+def _ssh(user: str, name: str) -> tuple[str, ...]:
+    return ("ssh", "-oBatchMode=yes", "-oConnectTimeout=2", f"{user}@{name}")
 
 
 def wait_up(name: str) -> None:
