@@ -72,8 +72,10 @@ def plan_test(form: str) -> list[Step]:
         return [*plan_unit(form), *plan_system(form)]
     (unit,) = plan_unit(form)
     build, inside, several = build_step(), limits_step(), machines_steps()
-    queue = [replace(one, after=(unit.name,)) for one in plan_system("container")]
-    inside, *several = (replace(one, after=(unit.name,)) for one in (inside, *several))
+    # What they take beside all others.
+    queue = [replace(one, after=(unit.name,), minutes=21) for one in plan_system("container")]
+    several = [replace(one, after=(unit.name,), minutes=12) for one in several]
+    inside = replace(inside, after=(unit.name,))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
     arm = replace(openarm_step(), after=(restarted.name,))
     oldest, newest = platform_step(OLD_SUITE, minutes=2), platform_step(NEW_SUITE, "-k", NEW)
