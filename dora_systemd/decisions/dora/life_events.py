@@ -12,7 +12,8 @@ _SPAWNED = re.compile(r"spawned node with pid (\d+)")
 _EXITED = re.compile(
     r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"
 )
-_STALE = "ignoring stale exit from pid "
+_STALE = re.compile(r"ignoring stale exit from pid (\d+) ")
+_RESTART_LOOP = re.compile(r"not restarting node|max restarts|waiting .* before restart")
 _UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
 _CASCADED = re.compile(r"marking `(.+)` as cascading error caused by `(.+)`")
 
@@ -44,9 +45,18 @@ def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
     return None
 
 
-def is_note_of_stale(record: LogRecord) -> bool:
-    """Return whether dora reports that the last exit was of a replaced or removed process."""
-    return record.target == "daemon" and record.message.startswith(_STALE)
+def parse_stale(record: LogRecord) -> int:
+    """Return the pid if dora reports that the last exit was of a replaced or removed process, or 0.
+
+    Dora reports that right after the exit, which has no pid.
+    """
+    stale = _STALE.match(record.message) if record.target == "daemon" else None
+    return int(stale[1]) if stale else 0
+
+
+def precedes_exit(record: LogRecord) -> bool:
+    """Whether dora's restart loop prints this, of a process whose exit dora reports after that."""
+    return record.target == "daemon" and _RESTART_LOOP.match(record.message) is not None
 
 
 def parse_daemon_line(line: str, at_us: int) -> life.Event | None:

@@ -6,6 +6,7 @@ becomes an event of the pump, and so does every exception.
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import replace
 from typing import Any
 
 from dora_systemd.adapters.dora import engine
@@ -40,6 +41,9 @@ _QUIET_SECONDS = 0.1
 _WAITING_SECONDS = 1.0
 """Time for the effect of a stop on other nodes to be seen, if there are any."""
 _LONG_SECONDS = 3600.0 * 24 * 365
+_NOTE_SECONDS = 1.0
+"""Time for dora's next record about a node that has exited. It comes at once, but on a busy machine
+there is time between the two."""
 
 
 class Dialogue(Tasks):
@@ -55,6 +59,7 @@ class Dialogue(Tasks):
         self._nodes = nodes
         self._pipes = pipes
         self._loop = asyncio.get_running_loop()
+        self._exits: dict[str, tuple[life.NodeExited, asyncio.TimerHandle]] = {}
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -173,6 +178,7 @@ class Dialogue(Tasks):
         return (has("owes") and is_probe(node)) or (has("record") and is_recorder(node))
 
     def _hear(self, record: protocol.LogRecord) -> None:
+        self._release_exits(record)
         if self._is_own(record.node):
             return
         if not self._is_here(record.node):
@@ -182,16 +188,55 @@ class Dialogue(Tasks):
         if isinstance(event, life.NodeSpawned):
             self._nodes.adopt(event.node, event.pid, rights_of(self._options))
         if isinstance(event, life.NodeExited):
-            node = self._pump.cell.nodes.get(event.node)
-            is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
-            essential = event.node in essential_nodes(self._options)
-            oom = self._nodes.find_oom(event.node)
-            event = life_events.with_facts(event, is_stale, oom, essential)
-            if node is not None and not is_stale:
-                self._clear(event, node)
-        if event is not None:
+            is_running = self._pump.cell.state is State.RUNNING
+            (self._hold_exit if is_running else self._exited)(event)
+        elif event is not None:
             self._pump.push(event)
-        if isinstance(event, life.NodeExited) and not event.is_stale:
+
+    def _hold_exit(self, event: life.NodeExited) -> None:
+        """Hold an exit back until dora's next record about the node, which may name the process.
+
+        Two processes of a node can exit at about the same time: the one that was replaced, by
+        SIGTERM, and the next one, which fails. A stop waits for no other record.
+        """
+        self._release_exit(event.node)
+        timer = self._loop.call_later(_NOTE_SECONDS, self._release_exit, event.node)
+        self._exits[event.node] = event, timer
+
+    def _release_exits(self, record: protocol.LogRecord) -> None:
+        if life_events.precedes_exit(record):
+            return
+        stale = life_events.parse_stale(record)
+        for event, _ in [*self._exits.values()]:
+            if record.node in ("", event.node) and (stale or self._is_explained(event)):
+                self._release_exit(event.node, stale)
+
+    def _is_explained(self, event: life.NodeExited) -> bool:
+        """Whether nothing but dora explains this exit."""
+        del event
+        return True
+
+    def _release_exit(self, node: str, stale: int = 0) -> None:
+        if found := self._exits.pop(node, None):
+            event, timer = found
+            timer.cancel()
+            self._exited(event, stale)
+
+    def _exited(self, event: life.NodeExited, stale: int = 0) -> None:
+        """Push an exit. stale: the pid, if dora has removed or replaced the process that exited."""
+        node = self._pump.cell.nodes.get(event.node)
+        if stale and (node is None or node.pid != stale):
+            # Dora has cancelled the restart of that process, if there was to be one.
+            self._pump.push(replace(event, is_stale=True, will_restart=False))
+            return
+        is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
+        essential = event.node in essential_nodes(self._options)
+        oom = self._nodes.find_oom(event.node)
+        event = life_events.with_facts(event, is_stale, oom, essential)
+        if node is not None and not is_stale:
+            self._clear(event, node)
+        self._pump.push(event)
+        if not is_stale:
             self._nodes.forget(event.node)
 
     def _clear(self, event: life.NodeExited, node: NodeStatus) -> None:

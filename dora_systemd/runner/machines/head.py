@@ -64,8 +64,6 @@ _WATCH_SECONDS = 2.0
 _WORD_SECONDS = 1.0
 """Time for a member to report why its daemon has ended, or why it ended a node."""
 _EXTEND_SECONDS = 10.0
-_NOTE_SECONDS = 0.05
-"""Time for dora to report that an exit was of a replaced process; the report comes next."""
 _TOLD_SECONDS = 3.0
 """Longer than a member takes until its table comes, with the next beat."""
 
@@ -194,7 +192,6 @@ class HeadDialogue(Dialogue):
         self._roster, self._dora = roster, dora
         self._ends_at, self._is_ending = 0.0, False
         self._unreached: dict[str, str] = {}
-        self._exits: dict[str, life.NodeExited] = {}
         self._differing: dict[str, list[str]] = {}
         roster.on_programs = self._compare
 
@@ -323,34 +320,26 @@ class HeadDialogue(Dialogue):
     def _hear_elsewhere(self, record: protocol.LogRecord) -> None:
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
-            self._tell_exit(event.node)
+            self._release_exit(event.node)
             event = replace(event, pid=0)  # here another process has that number
         if isinstance(event, life.NodeExited):
             essential = event.node in essential_nodes(self._options)
-            self._exits[event.node] = life_events.with_facts(event, False, None, essential)
-            wait = _WORD_SECONDS if self._is_unexplained(event.node) else _NOTE_SECONDS
-            self._loop.call_later(wait, self._tell_exit, event.node)
+            self._hold_exit(life_events.with_facts(event, False, None, essential))
         elif event is not None:
             self._pump.push(event)
 
-    def _is_unexplained(self, node: str) -> bool:
-        """Whether the member may have ended the node: its report takes another way than dora's."""
-        event, status = self._exits.get(node), self._pump.cell.nodes.get(node, NodeStatus())
-        return event is not None and event.exit == exit_of(-SIGABRT) and not status.hung
+    def _is_explained(self, event: life.NodeExited) -> bool:
+        """Whether no member may have ended the node: its report takes another way than dora's."""
+        status = self._pump.cell.nodes.get(event.node, NodeStatus())
+        return self._is_here(event.node) or event.exit != exit_of(-SIGABRT) or bool(status.hung)
 
-    def _hear(self, record: protocol.LogRecord) -> None:
-        """Handle a record of dora; hold back an exit until the next record explains it as stale."""
-        is_stale = life_events.is_note_of_stale(record)
-        for node in [record.node] if record.node else list(self._exits):
-            if is_stale or not self._is_unexplained(node):
-                self._tell_exit(node, is_stale)
-        super()._hear(record)
-
-    def _tell_exit(self, node: str, is_stale: bool = False) -> None:
-        if (event := self._exits.pop(node, None)) is not None:
-            status = self._pump.cell.nodes.get(node)
-            is_due = status is not None and status.state in ("reloading", "stopped")
-            self._pump.push(replace(event, is_stale=is_stale and not is_due))
+    def _exited(self, event: life.NodeExited, stale: int = 0) -> None:
+        if self._is_here(event.node):
+            super()._exited(event, stale)
+            return
+        status = self._pump.cell.nodes.get(event.node)
+        is_due = status is not None and status.state in ("reloading", "stopped")
+        self._pump.push(replace(event, is_stale=bool(stale) and not is_due))
 
     async def _ask_stop(self) -> None:
         self._begin_end()

@@ -243,10 +243,10 @@ class Nodes:
     def has_process(self, node: str, pid: int) -> bool:
         """Whether `pid` is a live process of the node. Zombies do not count.
 
-        A new process is in the daemon's group until its launcher moves it.
+        A new process is in the daemon's group until its launcher moves it: so that one is first.
         """
         return any(
-            pid in cgroup.pids(one) for one in (self._group(node), self._unit / cgroup.SUPERVISOR)
+            pid in cgroup.pids(one) for one in (self._unit / cgroup.SUPERVISOR, self._group(node))
         )
 
     async def wait_gone(self, node: str, pid: int) -> None:

@@ -53,6 +53,30 @@ def test_the_kernel_is_told_before_the_nodes_move(tmp_path: Path, is_there: bool
     assert (procs.read_text() if procs.exists() else None) == ("0" if is_there else None)
 
 
+def test_a_launcher_that_moves_meanwhile_is_found(tmp_path: Path) -> None:
+    """It moves from the group of the daemon to that of its node while the two are read."""
+    supervisor, own = (tmp_path / one / "cgroup.procs" for one in ("supervisor", "node-a"))
+    for procs in (supervisor, own):
+        procs.parent.mkdir()
+    supervisor.write_text("8\n")
+    os.mkfifo(own)  # what reads it sees that the process is not there yet
+
+    def move() -> None:
+        with own.open("w"):
+            supervisor.write_text("")
+
+    moving = threading.Thread(target=move)
+    moving.start()
+
+    async def find() -> bool:
+        pipes = LogPipes(asyncio.get_running_loop(), SlowJournal(), Origin("robot", "uuid"))
+        return Nodes(tmp_path, CellPaths(tmp_path), pipes).has_process("a", 8)
+
+    assert asyncio.run(find())
+    os.close(os.open(own, os.O_RDONLY | os.O_NONBLOCK))
+    moving.join()
+
+
 def test_a_node_that_dora_reads_is_removed_and_taken_back(tmp_path: Path) -> None:
     raw = {"id": "a", "path": "a.py", "outputs": ["said"], "send_stdout_as": "said"}
     dataflow = parse_dataflow({"nodes": [raw]}, "dataflow.yml")
