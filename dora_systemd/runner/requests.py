@@ -185,7 +185,7 @@ class NodeRequests:
         try:
             await (hand.bring_back(target) if is_stopped(old) else hand.replace(target))
         except DoraSystemdError as error:
-            _give_up(run, node, error)
+            _give_up(run, target, error)
             raise
         return f"Node restarting: {node}"
 
@@ -207,10 +207,19 @@ class NodeRequests:
         await self._role.tell_asked(target.status.machine, event)
 
 
-def _give_up(run: Run, node: str, error: DoraSystemdError) -> None:
-    """Mark an ended node as failed, because dora refuses to start the node again."""
-    if not run.pump.cell.nodes[node].pid:
-        how = Exit(words=error.message.removeprefix("cannot do that in "))
+def _give_up(run: Run, target: Target, error: DoraSystemdError) -> None:
+    """Mark an ended node as failed, because dora refuses to start the node again.
+
+    Dora also refuses that for a node that failed by itself just before: then its exit is the cause,
+    which can also be received later.
+    """
+    node, status = target.node, run.pump.cell.nodes[target.node]
+    if target.has_process and status.state == "reloading":
+        run.pump.push(life.NodeKept(now_us(), node, target.status))
+    elif not status.pid:
+        is_cause = protocol.NO_NODE in error.message and status.exit.is_failure
+        refused = Exit(words=error.message.removeprefix("cannot do that in "))
+        how = status.exit if is_cause else refused
         run.pump.push(life.NodeExited(now_us(), node, how, will_restart=False))
 
 

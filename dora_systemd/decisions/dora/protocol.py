@@ -189,6 +189,10 @@ def replace_params(run: str, definition: Mapping[str, Any]) -> Params:
     return {"ReplaceNode": {"dataflow_id": run, "node": definition, "grace_duration": overlap}}
 
 
+NO_NODE = "no running node"
+"""In dora's refusal of ReplaceNode for a node that it has given up."""
+
+
 def add_params(run: str, definition: Mapping[str, Any]) -> Params:
     """Add a node to a running dataflow."""
     return {"AddNode": {"dataflow_id": run, "node": definition}}

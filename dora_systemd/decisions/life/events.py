@@ -217,6 +217,14 @@ class NodeAsked(Event):
 
 
 @dataclass(frozen=True)
+class NodeKept(Event):
+    """Dora refuses a requested restart of the node, whose process continues, or has just failed."""
+
+    node: str
+    status: NodeStatus  # before the request
+
+
+@dataclass(frozen=True)
 class NodeReloading(Event):
     """The runner is about to end the node, and to start another process in its place."""
 

@@ -89,7 +89,7 @@ def _changed(nodes: NodeTable, event: life.Event, is_stopping: bool, is_open: bo
             nodes, record = _heard(nodes, event)
         case life.NodeLacks() | life.NodeMet():
             nodes, record = _needs(nodes, event)
-        case life.NodeAsked() | life.NodeReloading():
+        case life.NodeAsked() | life.NodeReloading() | life.NodeKept():
             nodes, record = _told_to_end(nodes, event)
         case life.NodeAdded() | life.NodeRemoved():
             others = {ident: node for ident, node in nodes.items() if ident != event.node}
@@ -108,7 +108,9 @@ def _ready(nodes: NodeTable, event: life.NodeReady, is_open: bool) -> Change:
     old, record = nodes.get(event.node, NodeStatus()), Record("node-ready", event.node)
     if is_stopped(old):  # dora has stopped the node meanwhile
         return nodes, record
-    fresh: dict[str, int | str] = {"restarts": _count(old), "asked": "", "asked_by": ""}
+    fresh: dict[str, int | str | Exit] = {"restarts": _count(old), "asked": "", "asked_by": ""}
+    if old.asked:
+        fresh["exit"] = Exit()  # that end was requested
     state = "running" if is_open else "ready"
     return _set(nodes, event.node, event.at_us, state=state, **fresh), record
 
@@ -117,10 +119,21 @@ def _added(event: life.NodeAdded | life.NodeRemoved) -> NodeTable:
     return {event.node: event.status} if isinstance(event, life.NodeAdded) else {}
 
 
-def _told_to_end(nodes: NodeTable, event: life.NodeAsked | life.NodeReloading) -> Change:
+def _told_to_end(
+    nodes: NodeTable, event: life.NodeAsked | life.NodeReloading | life.NodeKept
+) -> Change:
     if isinstance(event, life.NodeAsked):
         return _asked(nodes, event)
-    return _reloading(nodes, event), None
+    if isinstance(event, life.NodeReloading):
+        return _reloading(nodes, event), None
+    return _kept(nodes, event), None
+
+
+def _kept(nodes: NodeTable, event: life.NodeKept) -> NodeTable:
+    """Forget a requested restart of a process that has not ended: its end is not requested now."""
+    old = nodes.get(event.node, NodeStatus())
+    is_same = was_asked(old) and not is_stopped(old) and old.pid == event.status.pid
+    return {**nodes, event.node: event.status} if is_same else nodes
 
 
 def _reloading(nodes: NodeTable, event: life.NodeReloading) -> NodeTable:
@@ -307,8 +320,11 @@ def _exited_as_told(nodes: NodeTable, event: life.NodeExited, old: NodeStatus) -
         return {**nodes, event.node: old._replace(pid=0, is_held=False)}, None
     if is_stopped(old):
         return {**nodes, event.node: old._replace(pid=0, exit=event.exit)}, record
-    state = "starting" if was_asked(old) else old.state
-    return _set(nodes, event.node, event.at_us, state=state, pid=0), record
+    if not was_asked(old):
+        return _set(nodes, event.node, event.at_us, pid=0, state=old.state), record
+    # Dora may refuse the next process, because this one has failed by itself.
+    ended = _set(nodes, event.node, event.at_us, pid=0, state="starting", exit=event.exit)
+    return ended, record
 
 
 def with_downstream(record: Record, downstream: Downstream) -> Record:

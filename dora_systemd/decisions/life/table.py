@@ -31,7 +31,8 @@ _NODES: dict[str, Handler] = dict.fromkeys(
 )
 _RELOADS: dict[str, Handler] = {
     **dict.fromkeys(
-        ("NodeAsked", "NodeReloading", "NodeAdded", "NodeRemoved", "NodeLacks"), handle.node_event
+        ("NodeAsked", "NodeKept", "NodeReloading", "NodeAdded", "NodeRemoved", "NodeLacks"),
+        handle.node_event,
     ),
     "NodeMet": handle.node_met,
     "ReloadNoted": handle.note_reload,

@@ -111,7 +111,7 @@ def _format_lacking(cell: Cell) -> str:
 
 
 def _with_exit(ident: str, node: NodeStatus) -> str:
-    return f"{ident} ({node.exit})" if node.exit.is_failure else ident
+    return f"{ident} ({node.exit})" if node.exit.is_failure and not node.asked else ident
 
 
 def _names(texts: list[str]) -> str:

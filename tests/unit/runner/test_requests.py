@@ -129,6 +129,44 @@ def test_a_node_that_dora_does_not_add_again_has_failed(tmp_path: Path) -> None:
     assert str(bench.status("c").exit) == "dora: it is too late"
 
 
+@pytest.mark.parametrize("is_late", [False, True], ids=["before", "after"])
+def test_a_node_that_fails_just_before_dora_replaces_it(tmp_path: Path, is_late: bool) -> None:
+    """Its own exit is the cause, also if dora's refusal overtakes it."""
+
+    async def scene(bench: AskedBench) -> None:
+        def fail() -> None:
+            bench.pump.push(life.NodeExited(1, "a", exit_of(1), False))
+
+        def follow(event: life.Event) -> None:
+            if isinstance(event, life.NodeAsked):
+                fail()
+
+        refusal = "no running node `a` to replace; use `dora node add`"
+        bench.dora.refuses["ReplaceNode"] = refusal
+        if not is_late:
+            bench.pump.on_event = follow
+        with pytest.raises(DoraSystemdError, match="no running node"):
+            await bench.ask("restart", "a")
+        if is_late:
+            fail()
+
+    bench = run(tmp_path, scene, a=NEVER)
+    assert (bench.status("a").state, bench.status("a").exit) == ("failed", exit_of(1))
+    assert bench.events()[-1] == "node-crashed"
+
+
+def test_a_node_that_dora_does_not_replace_runs_on(tmp_path: Path) -> None:
+    """Then a crash of it is one: nobody has requested that any more."""
+
+    async def scene(bench: AskedBench) -> None:
+        bench.dora.refuses["ReplaceNode"] = "replacement adds input `i`"
+        with pytest.raises(DoraSystemdError, match="adds input"):
+            await bench.ask("restart", "a")
+
+    bench = run(tmp_path, scene, a=NEVER)
+    assert bench.status("a") == NEVER
+
+
 def test_a_stop_of_the_dataflow_that_comes_meanwhile(tmp_path: Path) -> None:
     async def scene(bench: AskedBench) -> None:
         def stop() -> None:

@@ -73,6 +73,10 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
         life.NodeAsked(1, "a", "restart", "root"),
         life.NodeAsked(1, "a", "stop", "root"),
     ),
+    life.NodeKept: (
+        life.NodeKept(1, "a", NodeStatus("running", 7)),
+        life.NodeKept(1, "unknown", NodeStatus()),
+    ),
     life.NodeAdded: (life.NodeAdded(1, "c", NodeStatus()),),
     life.NodeRemoved: (life.NodeRemoved(1, "a"), life.NodeRemoved(1, "unknown")),
     life.ReloadNoted: (life.ReloadNoted(1, "a.py: line 3: invalid syntax"),),

@@ -71,7 +71,7 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
         (),
     ),
     "ready": (
-        RUNS._replace(state="starting", asked=RESTART, asked_by=BY),
+        RUNS._replace(state="starting", asked=RESTART, asked_by=BY, exit=CRASH),
         life.NodeReady(20, "a"),
         RUNS._replace(since_us=20),
         (Record("node-ready", "a"),),
@@ -198,8 +198,20 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
     "the end that a restart needs": (
         RELOADS._replace(asked=RESTART),
         exited(),
-        RUNS._replace(state="starting", pid=0, since_us=20, asked=RESTART),
+        RUNS._replace(state="starting", pid=0, since_us=20, asked=RESTART, exit=CRASH),
         (Record("node-exited", "a", {"exit": "exit code 1", "asked": RESTART}),),
+    ),
+    "a restart that dora refuses": (
+        RELOADS._replace(asked=RESTART),
+        life.NodeKept(20, "a", RUNS),
+        RUNS,
+        (),
+    ),
+    "a restart that dora refuses after the end": (
+        RELOADS._replace(asked=RESTART, pid=0),
+        life.NodeKept(20, "a", RUNS),
+        RELOADS._replace(asked=RESTART, pid=0),
+        (),
     ),
     "the end that a reload needs": (
         RELOADS,
