@@ -12,10 +12,12 @@ A node with readers is only removed if it has no launcher of ours.
 """
 
 import asyncio
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.runner_socket.client import Request, refused_reply, unknown_request
 from dora_systemd.adapters.runner_socket.listener import Answer
 from dora_systemd.decisions.cell.exits import Exit
@@ -37,6 +39,7 @@ from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.decisions.needs.waiting import format_wait
 from dora_systemd.errors import DoraSystemdError, ExitCode, TimedOut
+from dora_systemd.runner.cell.clock import extend_timeout
 from dora_systemd.runner.cell.machine_role import Alone
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.check import check_start
@@ -128,10 +131,18 @@ _UNKNOWN_CALLER = "an unknown caller"
 
 
 class NodeRequests:
-    """Requests for nodes of the current run, which `reloader` knows. role: of this machine."""
+    """Requests for nodes of the current run, which `reloader` knows. role: of this machine.
 
-    def __init__(self, reloader: Reloader, role: Alone) -> None:
-        self._reloader, self._role = reloader, role
+    extend: extends the timeout of the unit's job.
+    """
+
+    def __init__(
+        self,
+        reloader: Reloader,
+        role: Alone,
+        extend: Callable[[int], object] = notify.extend_timeout,
+    ) -> None:
+        self._reloader, self._role, self._extend = reloader, role, extend
         self._hand: Hand | None = None
 
     async def answer(self, request: Mapping[str, Any]) -> Reply:
@@ -140,7 +151,9 @@ class NodeRequests:
         Other requests are for the reloader. Raises DoraSystemdError.
         """
         if request.get("verb") != VERB:
-            return await self._reloader.answer(request)
+            of_job = self._extending() if request.get("is_job") else contextlib.nullcontext()
+            with of_job:
+                return await self._reloader.answer(request)
         what, node = request.get("what"), str(request.get("node"))
         by, grace = str(request.get("by") or _UNKNOWN_CALLER), request.get("grace")
         if what not in (RESTART, STOP) or not (grace is None or type(grace) is int):
@@ -152,6 +165,15 @@ class NodeRequests:
             target = self._target(run, node, grace)
             do = self._restart if what == RESTART else self._stop
             return {"done": [await do(run, target, by)]}
+
+    @contextlib.contextmanager
+    def _extending(self) -> Iterator[None]:
+        """Let `systemctl reload` wait for the reload, however short TimeoutStartSec= is."""
+        extending = asyncio.create_task(extend_timeout(self._extend))
+        try:
+            yield
+        finally:
+            extending.cancel()
 
     def _target(self, run: Run, node: str, given: int | None) -> Target:
         status = run.pump.cell.nodes.get(node)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.system.cells import DOUBLER, SINK, THREE_NODES, Cell, Project, wait_for
+from tests.system.cells import DOUBLER, SINK, THREE_NODES, Cell, Project, run, wait_for
 
 HOT = "--hot-reload"
 SHARED = "FACTOR = 2\n"
@@ -257,6 +257,26 @@ def test_by_hand(cell: Cell, project: Project) -> None:
     assert "The node second was added: dataflow.yml" in done.stdout
     assert cell.doractl("reload", cell.name).stdout == "Nothing has changed\n"
     cell.wait_exchanging()
+
+
+@pytest.mark.lab
+@pytest.mark.warns(*OVERLAP)
+def test_systemd_waits_for_a_reload(cell: Cell, project: Project) -> None:
+    """TimeoutStartSec= would end the command, and the runner would go on with the reload."""
+    cell.start(project.three_nodes())
+    # Not by --property: a start on a busy machine takes longer.
+    drop_in = Path(f"/run/systemd/system/{cell.unit}.d/short.conf")
+    drop_in.parent.mkdir(exist_ok=True)
+    drop_in.write_text("[Service]\nTimeoutStartSec=2s\n")
+    run("systemctl", "daemon-reload")
+    assert cell.show("TimeoutStartUSec") == "2s"
+    project.write("sink.py", f"import time\ntime.sleep(4)\n{SINK}")
+    cell.systemctl("reload")
+    (done,) = reloads(cell)
+    assert done["DORA_NODE"] == "sink"
+    cell.end()
+    shutil.rmtree(drop_in.parent)
+    run("systemctl", "daemon-reload")
 
 
 @pytest.mark.warns(NOT_RELOADED)

@@ -24,6 +24,16 @@ _SLACK_SECONDS = 2.0
 """A block that takes so much longer than it may was not running, or had no CPU time."""
 
 
+_EXTEND_SECONDS = 10.0
+
+
+async def extend_timeout(extend: Callable[[int], object] = notify.extend_timeout) -> None:
+    """Extend the timeout of the job of the unit until this is cancelled, see sd_notify(3)."""
+    while True:
+        extend(round(3 * _EXTEND_SECONDS * SECOND))
+        await asyncio.sleep(_EXTEND_SECONDS)
+
+
 class Gaps:
     """Notices that this process did not run for a while, as when its unit was frozen.
 

@@ -12,7 +12,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths, own_directory
 
 MOST_SECONDS = 24 * 3600.0
-"""A bound for the answer; TimeoutStartSec= of the unit bounds this command, too."""
+"""A bound for the answer. The runner extends TimeoutStartSec= of the unit meanwhile, which would
+end this command and not the reload."""
 
 
 def main() -> int:
@@ -23,7 +24,7 @@ def main() -> int:
             hint = "systemd runs this: use `doractl reload`"
             raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
         path = CellPaths(Path(directory)).socket
-        done = done_of(path, order(path, {"verb": "reload"}, most=MOST_SECONDS))
+        done = done_of(path, order(path, {"verb": "reload", "is_job": True}, most=MOST_SECONDS))
     except DoraSystemdError as error:
         print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
         return error.code

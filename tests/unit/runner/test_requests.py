@@ -23,6 +23,7 @@ from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.requests import NodeRequests, Recheck, end_held
 from dora_systemd.values import SECOND
+from tests.unit.fakes.loop import live
 from tests.unit.fakes.programs import make_dora
 from tests.unit.fakes.reload import EXCHANGES, ReloadBench
 
@@ -40,7 +41,13 @@ LINES = ("a, outputs: [o]", "b, inputs: {i: a/o}", "c, inputs: {t: dora/timer/mi
 class AskedBench(ReloadBench):
     """Node a, which b reads, and c, which nobody reads; they end with an error."""
 
-    def __init__(self, root: Path, state: State = State.RUNNING, **nodes: NodeStatus) -> None:
+    def __init__(
+        self,
+        root: Path,
+        state: State = State.RUNNING,
+        extend: Callable[[int], object] = int,
+        **nodes: NodeStatus,
+    ) -> None:
         super().__init__(root, state, **{"a": RUNNING, "c": RUNNING, **nodes})
         (root / "io").mkdir()
         self.gates = self.nodes.gates = Gates(CellPaths(root))
@@ -48,7 +55,7 @@ class AskedBench(ReloadBench):
         self.flow.write_text(f"nodes:\n{lines}")
         reloader = Reloader(self.options, {}, SettingsFile("none.yml", root / "kept.yml"))
         reloader.begin(self.run, prepare(self.options, {}), 0)
-        self.requests = NodeRequests(reloader, Alone(self.options, Life("uuid")))
+        self.requests = NodeRequests(reloader, Alone(self.options, Life("uuid")), extend)
 
     def end(self) -> None:
         self.pump.push(
@@ -165,6 +172,24 @@ def test_a_node_that_dora_does_not_replace_runs_on(tmp_path: Path) -> None:
 
     bench = run(tmp_path, scene, a=NEVER)
     assert bench.status("a") == NEVER
+
+
+@pytest.mark.parametrize(("is_job", "times"), [(True, 4), (False, 0)])
+def test_a_slow_reload_extends_the_timeout_of_its_job(
+    tmp_path: Path, is_job: bool, times: int
+) -> None:
+    """The next process of c is not ready in its 30 s."""
+    extended: list[int] = []
+
+    async def work() -> None:
+        bench = AskedBench(tmp_path, extend=extended.append)
+        bench.dora.then["AddNode"] = lambda: bench.pump.push(life.NodeSpawned(2, "c", 8))
+        with pytest.raises(DoraSystemdError, match="not ready within 30s"):
+            await bench.requests.answer({"verb": "reload", "node": "c", "is_job": is_job})
+        await asyncio.sleep(60)
+
+    live(work)
+    assert extended == times * [30 * SECOND], "systemd gives it 30 s from each message"
 
 
 def test_a_stop_of_the_dataflow_that_comes_meanwhile(tmp_path: Path) -> None:
