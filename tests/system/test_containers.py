@@ -5,6 +5,7 @@ With podman as a user; of docker only the client and the cgroup are here, and bo
 
 import json
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -16,6 +17,7 @@ import pytest
 
 from dora_systemd.adapters.cgroup.groups import group_path, is_populated
 from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.gateways import Front
 
 HEX = "d0c" * 21 + "e"
 SCOPE = f"docker-{HEX}.scope"
@@ -92,7 +94,7 @@ def container_of_alice(name: str) -> dict[str, Any]:
 @PODMAN
 @pytest.mark.lab
 @pytest.mark.warns("conmon", "podman", "libpod", "crun")
-def test_podman_without_more(hers: Callable[..., None]) -> None:
+def test_podman_without_more(hers: Callable[..., None], alice: Front) -> None:
     """Its container is in a scope of its own: no limit holds, and it survives."""
     hers("--name=outer")
     one = container_of_alice("outer")
@@ -100,6 +102,12 @@ def test_podman_without_more(hers: Callable[..., None]) -> None:
     words = f"policy: podman container outer ({one['id'][:12]}, "
     for verb in ("list", "why"):
         assert words in as_alice("doractl", verb, "hers")
+    assert "Running (outside: podman outer " in as_alice("doractl", "top", "hers", "--once")
+    alice.up()
+    labels = '{dataflow="hers",node="policy",program="podman",container="outer"}'
+    metric = re.escape(f"dora_node_outside_memory_bytes{labels}")
+    (memory,) = re.findall(rf"{metric} (\d+)", alice.get("/metrics", user="alice").body)
+    assert int(memory) > 0
     (line,) = as_alice("doractl", "stop", "hers").splitlines()
     first, _, second = line.partition("; ")
     assert first.startswith("Dataflow stopped: ")
@@ -111,16 +119,18 @@ def test_podman_without_more(hers: Callable[..., None]) -> None:
 @PODMAN
 @pytest.mark.lab
 @pytest.mark.warns("conmon", "podman", "libpod", "crun", "policy")
-def test_a_node_that_is_stopped_leaves_its_container(hers: Callable[..., None]) -> None:
+@pytest.mark.parametrize("verb", ["stop", "restart"])
+def test_a_node_that_is_ended_leaves_its_container(hers: Callable[..., None], verb: str) -> None:
     """The journal says when it began, and who stops the node is told that it still runs."""
     hers("--name=outer")
     one = container_of_alice("outer")
     text = "Node policy has started a container of podman outside of its cgroup"
     wait_for("the event", lambda: text in as_alice("doractl", "logs", "hers", "--events"))
-    (line,) = as_alice("doractl", "node", "stop", "hers", "policy").splitlines()
-    assert line.startswith(f"Node stopping: policy; podman container outer ({one['id'][:12]}, ")
+    (line,) = as_alice("doractl", "node", verb, "hers", "policy").splitlines()
+    first = f"Node {verb}{'p' * (verb == 'stop')}ing: policy; podman container outer "
+    assert line.startswith(f"{first}({one['id'][:12]}, ")
     assert line.endswith("of policy still runs, run: podman stop outer")
-    assert as_alice("doractl", "logs", "hers", "--events").count(text) == 1
+    assert verb == "restart" or as_alice("doractl", "logs", "hers", "--events").count(text) == 1
 
 
 @PODMAN

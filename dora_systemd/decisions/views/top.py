@@ -101,11 +101,23 @@ def _node_row(node: NodeRow, entry: TopEntry, look: Look) -> TopRow:
     uptime = format_uptime(max(look.at_us - node.since, 0)) if is_alive else UNKNOWN
     word = node.word
     words = node.silent or (cut(node.text, _MOST_WORDS) if is_alive else node.exit)
+    words = "; ".join(filter(None, (words, _outside(node))))
     state = f"{word} ({words})" if words else word
     place = f" on {node.machine}" if node.machine else ""
     cells = (f"  {node.node}{place}", state, uptime, *_numbers(node, entry.waits, node.node))
     whole = entry.row
     return TopRow(whole.uuid, whole.name, node.node, word, cells)
+
+
+def _outside(node: NodeRow) -> str:
+    """Format "outside: podman policy 9.1G": containers, which are in no other number of the row."""
+    parts = (
+        " ".join((*filter(None, one.labels.values()), format_memory(one.memory)))
+        for one in node.containers
+        if not one.is_inside
+    )
+    found = ", ".join(parts)
+    return found and f"outside: {found}"
 
 
 def _numbers(

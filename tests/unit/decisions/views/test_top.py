@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from dora_systemd.decisions.resources.containers import Container
 from dora_systemd.decisions.views.facts import NodeRow
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.top import (
@@ -54,6 +55,24 @@ def test_what_a_node_says_of_itself() -> None:
     shown = format_top(Look(NOW, (TopEntry(ROBOT.row._replace(nodes=nodes)),)), "cpu")
     assert "  camera  Running (12 frames/s)" in shown
     assert "Failed (exit code 1)" in shown
+
+
+def test_containers_of_a_node_outside_of_its_cgroup() -> None:
+    outer = Container("podman", "a" * 64, "outer", "/user.slice/x.scope", 9 << 30)
+    inner = outer._replace(name="inner", is_inside=True)
+    (camera, *others) = ROBOT.row.nodes
+
+    def shown(*containers: Container, text: str = "") -> str:
+        node = camera._replace(containers=containers, text=text)
+        row = ROBOT.row._replace(nodes=(node, *others))
+        return format_top(Look(NOW, (TopEntry(row),)), "cpu")
+
+    assert "  camera    Running (outside: podman outer 9G)  " in shown(outer, inner)
+    assert "Running (12 frames/s; outside: podman outer 9G)" in shown(outer, text="12 frames/s")
+    assert "(outside: docker -, podman aaaaaaaaaaaa 9G)" in shown(
+        Container("docker"), outer._replace(name="")
+    )
+    assert "outside" not in shown(inner)
 
 
 def test_table_by_cpu() -> None:
