@@ -85,11 +85,8 @@ def roll_back(
 
 def deployed_name(manager: Manager, scope: Scope, selector: str) -> str:
     """The name of the dataflow with releases that is meant. Raises DoraSystemdError (NOT_FOUND)."""
-    wanted, known = Selector(selector), deployed_names(scope)
-    for name in wanted.names:
-        if name in known:
-            return name
-    name = wanted.find(manager).name
+    known = deployed_names(scope)
+    name = Selector(selector).find_name(manager, scope, known)
     if name not in known:
         hint = f"doractl deploy --name {name} makes the first one"
         raise DoraSystemdError(f"{name} has no release", hint, ExitCode.NOT_FOUND)

@@ -28,7 +28,7 @@ from dora_systemd.verbs.releases.rollback import deployed_name, roll_back
 from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.releases.trial import read_standing
 from dora_systemd.verbs.start.request import StartRequest
-from tests.unit.fakes.journal import FakeJournal
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import UUID, FakeManager
 from tests.unit.fakes.notes import Notes
 from tests.unit.fakes.programs import make_program
@@ -285,6 +285,19 @@ def test_a_dataflow_without_releases(manager: FakeManager, scope: Scope) -> None
     error = refusal(lambda: deployed_name(manager, scope, "robot"))
     assert (error.message, error.code) == ("robot has no release", ExitCode.NOT_FOUND)
     assert error.hint == "doractl deploy --name robot makes the first one"
+
+
+def test_a_dataflow_that_has_ended(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, manager: FakeManager, scope: Scope
+) -> None:
+    """The UUID of one with releases is in the journal, as for `doractl forget`."""
+    FakeJournal(monkeypatch, tmp_path).write(
+        life_record("dataflow-stopped", 1, "robot", UUID, scope=scope)
+    )
+    error = refusal(lambda: deployed_name(manager, scope, UUID[:8]))
+    assert error.message == "robot has no release"
+    store_of(scope, "robot").path.mkdir(parents=True)
+    assert deployed_name(manager, scope, UUID[:8]) == "robot"
 
 
 def test_what_is_forgotten(
