@@ -1,5 +1,6 @@
 """System scope or user scope: selects the manager and its directories."""
 
+import errno
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,9 @@ NOTICE_NAME = "dora-systemd-notice"
 """The directory with a directory for each dataflow that has on_failure, see systemd.path(5)."""
 _CONTAINER_MARKS = (".dockerenv", "run/.containerenv")
 """Files by which docker and podman mark a container."""
+
+_SYSTEM_PLACES = ("/etc/", "/run/", "/usr/", "/var/")
+"""Where the files of the system's dataflows are; those of a user are below HOME."""
 
 
 class Scope(NamedTuple):
@@ -87,3 +91,14 @@ def without_systemd(root: Path = Path("/")) -> str:
         how = "boot it with /sbin/init, as podman run --systemd=always does, or use its host"
         return f"this container runs no systemd: {how}"
     return "this machine was not booted with systemd: make it the init system, and boot again"
+
+
+def place_hint(path: Path, error: OSError) -> str:
+    """Describe what to do if a file of doractl's own cannot be written at `path`."""
+    if error.errno == errno.EROFS:
+        return "the file system is mounted read-only"
+    if not isinstance(error, PermissionError):
+        return "see df"
+    if str(path).startswith(_SYSTEM_PLACES):
+        return "use sudo, or --user for a dataflow of your own"
+    return f"HOME is {os.environ.get('HOME', '')!r}: use one in which you can write"

@@ -16,7 +16,7 @@ from subprocess import CompletedProcess
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.system.cells import Project, run, wait_for
+from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.refusals import files_of, units
 
 # Mounts, and users that are made and removed.
@@ -97,6 +97,15 @@ def test_without_dora(flow: str) -> None:
     for verb in ("start", "run", "start --dry-run", "start --enable"):
         line = "cannot find the dora command"
         refuse(script, ExitCode.NO_DORA, line, hint, *verb.split(), flow)
+
+
+def test_from_a_directory_that_was_removed(cell: Cell, project: Project) -> None:
+    """A file that is named by its whole path needs none."""
+    flow, gone = str(project.three_nodes()), 'd=$(mktemp -d); cd "$d"; rmdir "$d"'
+    assert behind(gone, "doractl", "start", flow, "--name", cell.name).returncode == 0
+    assert cell.doractl("list", cell.name).stdout
+    line = "cannot read dataflow.yml: the current directory was removed"
+    refuse(gone, ExitCode.BAD_INPUT, line, "cd to a directory that exists", "start")
 
 
 @pytest.fixture(params=["--user-group", "--system"])

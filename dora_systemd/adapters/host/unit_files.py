@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import REFUSED, read_text, write_atomic
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import place_hint
 from dora_systemd.trust.paths import sync_directory
 
 _WRITTEN_SECONDS = 60.0
@@ -155,6 +156,6 @@ def _told(what: str, path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         is_refused = error.errno in REFUSED
-        hint = "use sudo, or --user for a dataflow of your own" if is_refused else ""
+        hint = place_hint(path, error) if is_refused else ""
         code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
         raise DoraSystemdError(f"cannot {what} {path}: {error.strerror}", hint, code) from error

@@ -29,6 +29,7 @@ from dora_systemd.decisions.releases.past import (
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import STORE, TREE, is_release_id
+from dora_systemd.scope import place_hint
 from dora_systemd.trust.files import MAX_BYTES, append_lines, read_file, read_lines
 from dora_systemd.trust.paths import sync_directory
 from dora_systemd.trust.programs import spawn
@@ -278,10 +279,9 @@ def stored_at(path: Path) -> Stored | None:
 
 def unusable(path: Path, error: OSError) -> DoraSystemdError:
     """The error for a store that cannot be used."""
-    is_refused = isinstance(error, PermissionError)
-    hint = "use sudo, or --user for a dataflow of your own" if is_refused else "see df"
-    code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
-    return DoraSystemdError(f"cannot use {shown(str(path))}: {error.strerror}", hint, code)
+    code = ExitCode.NO_PERMISSION if isinstance(error, PermissionError) else ExitCode.FAILURE
+    message = f"cannot use {shown(str(path))}: {error.strerror}"
+    return DoraSystemdError(message, place_hint(path, error), code)
 
 
 def write_part(directory: Path, name: str, text: str) -> None:

@@ -1,5 +1,6 @@
 """`doractl bundle`: writes a bundle to a file, or to the store of the dataflow."""
 
+import errno
 import os
 import platform
 import time
@@ -263,6 +264,7 @@ def _explained(path: Path) -> Iterator[None]:
     except OSError as error:
         is_refused = isinstance(error, PermissionError)
         code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
-        hint = "use sudo, or -o FILE in a directory of your own" if is_refused else "see df"
+        can_move = is_refused or error.errno == errno.EROFS
+        hint = "use sudo, or -o FILE in a directory of your own" if can_move else "see df"
         message = f"cannot write a bundle to {shown(str(path))}: {error.strerror}"
         raise DoraSystemdError(message, hint, code) from error

@@ -54,7 +54,7 @@ from dora_systemd.verbs.releases.trial import (
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.plan import Plan, make_plan
-from dora_systemd.verbs.start.request import StartRequest
+from dora_systemd.verbs.start.request import StartRequest, current_directory
 from dora_systemd.verbs.start.start import require_same_user
 from dora_systemd.verbs.start.unit import plan_properties
 from dora_systemd.verbs.start.where import account_of
@@ -254,7 +254,7 @@ def _unit_text(work: _Deploy, manifest: Manifest) -> str:
 
 
 def _given(request: StartRequest) -> dict[str, str | list[str]]:
-    return given_texts(request.flags, request.environment, Path.cwd())
+    return given_texts(request.flags, request.environment, current_directory())
 
 
 def _lost_note(former: Manifest | None, request: StartRequest, source: Source) -> Iterator[str]:

@@ -58,3 +58,11 @@ def path_of(request: StartRequest) -> Path:
         message = f"cannot read {shown(request.dataflow)}: the current directory was removed"
         hint = "cd to a directory that exists"
         raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT) from error
+
+
+def current_directory() -> Path:
+    """Return the current directory; "/" if it was removed: then no relative path was accepted."""
+    try:
+        return Path.cwd()
+    except FileNotFoundError:
+        return Path("/")

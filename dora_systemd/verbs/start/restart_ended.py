@@ -22,6 +22,7 @@ from dora_systemd.trust.paths import exists, is_directory
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
+from dora_systemd.verbs.start.request import current_directory
 
 if TYPE_CHECKING:
     from dora_systemd.verbs.start.plan import Plan
@@ -79,7 +80,7 @@ def note_start(plan: "Plan", request: "StartRequest", command: str) -> None:
         command,
         scope=plan.scope.word,
         file=options.dataflow,
-        settings=json.dumps(given_texts(request.flags, request.environment, Path.cwd())),
+        settings=json.dumps(given_texts(request.flags, request.environment, current_directory())),
     )
 
 

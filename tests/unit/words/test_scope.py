@@ -1,10 +1,11 @@
-"""Machines that were not booted with systemd: what to do there."""
+"""Machines that were not booted with systemd, and files that cannot be written: what to do."""
 
+import errno
 from pathlib import Path
 
 import pytest
 
-from dora_systemd.scope import without_systemd
+from dora_systemd.scope import place_hint, without_systemd
 
 
 @pytest.mark.parametrize(
@@ -22,3 +23,20 @@ def test_machines_without_systemd(tmp_path: Path, file: str, text: str, expected
     assert expected in without_systemd(tmp_path)
     (tmp_path / "run/systemd/system").mkdir(parents=True)
     assert without_systemd(tmp_path) == ""
+
+
+@pytest.mark.parametrize(
+    ("path", "number", "hint"),
+    [
+        ("/var/lib/dora-systemd/releases/x", errno.EACCES, "use sudo, or --user for a dataflow"),
+        ("/root/.local/state/dora-systemd", errno.EACCES, "HOME is '/root': use one in which you"),
+        ("/home/joe/.config/systemd/user", errno.EROFS, "the file system is mounted read-only"),
+        ("/var/lib/dora-systemd/releases/x", errno.EROFS, "the file system is mounted read-only"),
+        ("/home/joe/.local/state", errno.ENOSPC, "see df"),
+    ],
+)
+def test_places_that_cannot_be_written(
+    path: str, number: int, hint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/root")
+    assert place_hint(Path(path), OSError(number, "no")).startswith(hint)

@@ -30,7 +30,7 @@ from dora_systemd.verbs.start.read import (
     read_files,
     read_settings_file,
 )
-from dora_systemd.verbs.start.request import StartRequest, request_name
+from dora_systemd.verbs.start.request import StartRequest, current_directory, request_name
 from dora_systemd.verbs.start.settings import check_config, require_modest, settings_of
 from dora_systemd.verbs.start.where import account_of, choose_user
 from tests.unit.fakes.programs import make_dora, make_program
@@ -85,6 +85,8 @@ def test_no_directory_here(project: Path, monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(DoraSystemdError, match="the current directory was removed") as one:
         make_plan(USER, StartRequest("dataflow.yml"))
     assert one.value.code is ExitCode.BAD_INPUT
+    assert plan_of(project).options.name == "robot"
+    assert current_directory() == Path("/")
 
 
 def test_every_plan_has_a_uuid_of_its_own(project: Path) -> None:
