@@ -5,6 +5,7 @@ does, and knows the program. dora finds Python in VIRTUAL_ENV, as ours does.
 """
 
 import os
+import shutil
 import signal
 import subprocess
 from abc import ABC, abstractmethod
@@ -133,13 +134,20 @@ class DoraRun(Contestant):
         return self.process.pid
 
 
+def make_logs_of(user: str) -> None:
+    """Give a user the directory beside the dataflow into which dora writes its logs."""
+    logs = HOME / "out"
+    logs.mkdir(exist_ok=True)
+    shutil.chown(logs, user, user)
+
+
 class DoraRunOfUser(DoraRun):
     """The same as the user whom ours runs as: root may lock more memory for large messages."""
 
     user = "dora"
 
     def prepare(self) -> None:
-        HOME.chmod(0o777)  # it writes its logs beside the dataflow
+        make_logs_of(self.user)
 
 
 class DoraUp(Contestant):
@@ -147,10 +155,15 @@ class DoraUp(Contestant):
 
     name = "dora up, start"
     pids: tuple[int, ...]
+    user: str | None = None
 
-    def dora(self, *words: str) -> None:
+    def dora(self, *words: str, check: bool = True) -> None:
         """One command."""
-        run("dora", *words, env={**os.environ, **ENVIRONMENT}, cwd=HOME)
+        run("dora", *words, check=check, env=self.environment(), cwd=HOME, user=self.user)
+
+    def environment(self) -> dict[str, str]:
+        """Variables of a command."""
+        return {**os.environ, **ENVIRONMENT}
 
     def prepare(self) -> None:
         before = processes_of_dora()
@@ -173,11 +186,27 @@ class DoraUp(Contestant):
         return list(self.pids)
 
     def close(self) -> None:
-        run("dora", "down", "--force", env={**os.environ, **ENVIRONMENT}, check=False)
+        self.dora("down", "--force", check=False)
         # On a loaded machine it gives up before they have ended.
         for pid in self.pids:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
+
+
+class DoraUpOfUser(DoraUp):
+    """The same as the user whom ours runs as."""
+
+    user = "dora"
+
+    def environment(self) -> dict[str, str]:
+        return {**super().environment(), "HOME": str(HOME / "out")}
+
+    def prepare(self) -> None:
+        make_logs_of(self.user)
+        super().prepare()
+
+    def stop(self) -> None:
+        self.dora("stop", "--name", NAME, check=False)  # its nodes may have ended
 
 
 class SystemdRun(Contestant):

@@ -3,6 +3,7 @@
 Nothing between its markers is typed by hand.
 """
 
+import math
 import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -30,6 +31,7 @@ TITLES = {
     "reload": "Hot reload",
     "deploy": "Deploy",
     "owes": "Owed outputs",
+    "recorder": "The recorder",
     "machines": "Between machines",
     "spread": "Start over two machines",
     "platform-bookworm": "The packages on Debian 12",
@@ -50,6 +52,7 @@ HIGHLIGHTS = (
     ("cost", "private memory, with dora's own processes", "dora up, start"),
     ("cost", "CPU when idle, beside dora", "supervisord"),
     ("logs", "lines a second into the journal, one node", "writes to journald itself"),
+    ("messages", "latency of 41 kB", "dora up, start"),
     ("messages", "latency of 41 kB", "dora run"),
 )
 """Lines of the short table: record, figure, rival."""
@@ -67,11 +70,24 @@ def format_number(value: float) -> str:
     return f"{value:,.{digits}f}"
 
 
+MANY = 20
+"""From so many rounds on, the interval of confidence says more than the spread."""
+
+
 def format_ratio(ratios: Sequence[float]) -> str:
-    """The median, and from where to where they go."""
+    """The median, and from where to where they go; of many the mean and its interval at 95 %."""
+    if len(ratios) >= MANY and all(math.isfinite(one) and one > 0 for one in ratios):
+        return "**{:.2f}**, 95 %: {:.2f}–{:.2f}".format(*confidence(ratios))
     middle, low, high = statistics.median(ratios), min(ratios), max(ratios)
     spread = "" if len(ratios) == 1 else f", {low:.2f}–{high:.2f}"
     return f"**{middle:.2f}**{spread}"
+
+
+def confidence(ratios: Sequence[float]) -> tuple[float, float, float]:
+    """The geometric mean, and the ends of its interval of 95 %, for at least MANY ratios."""
+    logs = [math.log(one) for one in ratios]
+    middle, half = statistics.mean(logs), 1.96 * statistics.stdev(logs) / math.sqrt(len(logs))
+    return math.exp(middle), math.exp(middle - half), math.exp(middle + half)
 
 
 def format_cell(figure: Figure, name: str) -> str:

@@ -81,6 +81,11 @@ def test_ratio_has_a_spread_only_of_several_rounds() -> None:
     assert format_ratio([1.1]) == "**1.10**"
 
 
+def test_ratio_of_many_rounds_has_an_interval_of_confidence() -> None:
+    assert format_ratio([0.98, 1.02] * 20) == "**1.00**, 95 %: 0.99–1.01"
+    assert format_ratio([0.98, float("inf")] * 20) == "**inf**, 0.98–inf"
+
+
 def test_table() -> None:
     other = Figure("5 nodes", "ms", {"doractl": [1.5], "pm2": [3.0]}, goal="less")
     assert format_table([FIGURE, other]).splitlines() == [
@@ -165,7 +170,7 @@ def test_latency_is_of_the_calm_messages_and_throughput_of_the_fast_ones() -> No
     messages = [one for size in SIZES for one in messages_of(size, 500, 100)]
     found = results([(3, 0, 0, 10**12), *messages])
     assert found["latency of 4 MB"] == 500
-    assert found["throughput of 0 B messages"] == pytest.approx(10_000)
+    assert found["throughput of 8 B messages"] == pytest.approx(10_000)
 
 
 def test_each_link_stands_beside_bare_dora() -> None:
@@ -185,9 +190,9 @@ def test_each_link_stands_beside_bare_dora() -> None:
 
 def test_a_few_messages_may_be_lost() -> None:
     messages = [one for size in SIZES for one in messages_of(size, 500, 100)]
-    assert results(messages[10:])["latency of 0 B"] == 500
-    with pytest.raises(AssertionError, match="40 of 100 messages of 0 bytes"):
-        results(messages[60:])
+    assert results(messages[10:])["latency of 8 B"] == 500
+    with pytest.raises(AssertionError, match="80 of 200 messages of 8 bytes"):
+        results(messages[120:])
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,123 @@
+"""What it costs a consumer that its messages are recorded.  `python -m benchmarks.recorder [N]`
+
+One dataflow, whose recorder is switched on and off in turns while it runs, so that both have the
+same processes. 1 MB goes 30 times a second, 64 B 500 times; the consumer measures the latency.
+"""
+
+import statistics
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+from benchmarks.cost import cpu_seconds, private_mb
+from benchmarks.flows import STAMPS, clear_stamps, make_home
+from benchmarks.rounds import OURS, Figure, keep, shown, take_turns
+from tests.system.cells import Cell, Project, run, wait_for
+
+SECONDS = 6.0
+RECORDER = "node-dora-systemd-recorder"
+STREAMS = {"1 MB at 30 Hz": (1_000_000, 33), "64 B at 500 Hz": (64, 2)}
+"""Bytes of a message, and milliseconds between two."""
+SENDER = """
+import sys, time
+from dora import Node
+import pyarrow
+size = int(sys.argv[1])
+buffers = [None, pyarrow.py_buffer(bytes(size))]
+node, data = Node(), pyarrow.Array.from_buffers(pyarrow.uint8(), size, buffers)
+for event in node:
+    if event["type"] == "INPUT":
+        node.send_output("data", data, {"sent": time.monotonic_ns()})
+"""
+RECEIVER = """
+import sys, time
+from dora import Node
+with open(sys.argv[1], "w", buffering=1) as file:
+    for event in Node():
+        if event["type"] == "INPUT":
+            print(time.monotonic_ns() - event["metadata"]["sent"], file=file)
+"""
+STREAM = """
+  - {{id: sender-{size}, path: sender.py, args: "{size}",
+     inputs: {{tick: dora/timer/millis/{pause}}}, outputs: [data]}}
+  - {{id: receiver-{size}, path: receiver.py, args: "{file}", inputs: {{data: sender-{size}/data}}}}
+"""
+WITHOUT = "not recorded"
+
+
+def stamps(size: int) -> Path:
+    """Where the receiver of a stream writes the latencies, in ns."""
+    return STAMPS / str(size)
+
+
+def count(size: int) -> int:
+    """How many latencies there are."""
+    return stamps(size).read_bytes().count(b"\n") if stamps(size).exists() else 0
+
+
+def flow(project: Project) -> Path:
+    """The dataflow with both streams."""
+    parts = (
+        STREAM.format(size=size, pause=pause, file=stamps(size)) for size, pause in STREAMS.values()
+    )
+    return project.write("recorder.yml", "nodes:" + "".join(parts))
+
+
+def turn(cell: Cell, costs: list[tuple[float, float]], setting: str) -> list[float]:
+    """µs on the way of each stream, with the recorder on or off."""
+    cell.doractl("set", cell.name, "--record", setting)
+    is_on = setting != "off"
+    wait_for("the recorder", lambda: bool(cell.pids(RECORDER)) == is_on)
+    time.sleep(2)  # its first seconds are a start
+    begins = {size: count(size) for size, _ in STREAMS.values()}
+    before = [cpu_seconds(pid) for pid in cell.pids(RECORDER)]
+    time.sleep(SECONDS)
+    if is_on:
+        (pid,) = cell.pids(RECORDER)
+        costs.append((private_mb(pid), 100 * (cpu_seconds(pid) - before[0]) / SECONDS))
+    return [median_from(size, begin) for size, begin in begins.items()]
+
+
+def median_from(size: int, begin: int) -> float:
+    """Of the latencies of a stream from number `begin` on, in µs."""
+    lines = stamps(size).read_text().split("\n")[begin:-1]
+    return statistics.median(int(line) / 1000 for line in lines)
+
+
+def measure(rounds: int) -> list[Figure]:
+    """Latency of both streams; memory and CPU time of the recorder."""
+    project, costs = make_home(), list[tuple[float, float]]()
+    clear_stamps()
+    project.write("sender.py", SENDER)
+    project.write("receiver.py", RECEIVER)
+    cell = Cell("recorder")
+    words = ("--writable", str(STAMPS), "--name", cell.name)
+    run("doractl", "start", str(flow(project)), *words)
+    wait_for("messages flow", lambda: all(count(size) for size, _ in STREAMS.values()))
+    contestants = {OURS: partial(turn, cell, costs, "last=10s,memory=200M")}
+    contestants[WITHOUT] = partial(turn, cell, costs, "off")
+    found = take_turns(contestants, rounds)
+    cell.end()
+    return [shown(one) for one in figures(found, costs)]
+
+
+def figures(found: dict[str, list[list[float]]], costs: list[tuple[float, float]]) -> list[Figure]:
+    """The lines of the table."""
+    lines = [
+        Figure(
+            f"latency of {name} beside the recorder",
+            "µs",
+            {who: [one[number] for one in turns] for who, turns in found.items()},
+            "≤ 1.10",
+        )
+        for number, name in enumerate(STREAMS)
+    ]
+    memory, cpu = zip(*costs, strict=True)
+    lines.append(Figure("private memory of the recorder", "MB", {OURS: list(memory)}))
+    lines.append(Figure("CPU of the recorder", "%", {OURS: list(cpu)}))
+    return lines
+
+
+if __name__ == "__main__":
+    keep("recorder", measure, int(sys.argv[1]) if len(sys.argv) > 1 else 20)
