@@ -159,15 +159,16 @@ def test_it_is_changed_while_it_runs(cell: Cell, project: Project) -> None:
 
 
 FAST = """
-import os
+import os, time
 from dora import Node
 import pyarrow as pa
 node = Node()
 data = pa.array(memoryview(os.urandom(1_000_000)), type=pa.uint8())
-while True:
-    if node.try_recv() is not None:
-        break
+due = time.monotonic()
+while node.try_recv() is None:
     node.send_output("image", data)
+    due += 0.005  # 200 MB a second
+    time.sleep(max(0, due - time.monotonic()))
 """
 STUCK = """
 import os, signal
@@ -182,6 +183,7 @@ nodes:
   - {id: sink, path: sink.py, inputs: {image: camera/image}}
 """
 MESSAGES = int(os.environ.get("MESSAGES", "200"))
+"""An hour has 720,000 of them: `tests/lab/lab run --env MESSAGES=720000 -- pytest ...`."""
 
 
 @pytest.mark.warns(
@@ -192,13 +194,16 @@ def test_memory_is_bounded_though_a_consumer_is_stopped(cell: Cell, project: Pro
     project.write("sink.py", STUCK)
     path = project.write("flow.yml", FAST_FLOW)
     start(cell, path, "--record", "memory=8M,outputs=camera/image", "--grace-duration", "1s")
+    seen: set[int] = set()
 
     def is_done() -> bool:
         ring = Ring()
         assert not ring or ring.used <= 8.2 * 1024 * 1024
+        seen.update(cell.pids("node-dora-systemd-recorder"))
         return bool(ring) and ring.reading().states[0].received > MESSAGES
 
     wait_for("many messages were recorded", is_done, 60 + MESSAGES / 10)
+    assert len(seen) == 1, "nothing has killed the recorder, and no limit of its memory"
     assert 5 <= len(file_of(Ring()).messages) <= 8
 
 
