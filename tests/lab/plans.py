@@ -71,7 +71,9 @@ def plan_test(form: str) -> list[Step]:
     if form == "host":
         return [*plan_unit(form), *plan_system(form)]
     (unit,) = plan_unit(form)
-    build, inside, several = build_step(), limits_step(), machines_steps()
+    # The unit tests, which all others wait for, leave it a third of a processor.
+    build = replace(build_step(), after=())
+    inside, several = limits_step(), machines_steps()
     # What they take beside all others.
     queue = [replace(one, after=(unit.name,), minutes=21) for one in plan_system("container")]
     several = [replace(one, after=(unit.name,), minutes=12) for one in several]
@@ -79,10 +81,10 @@ def plan_test(form: str) -> list[Step]:
     restarted = replace(reboot_step(), after=(build.name, inside.name))
     arm = replace(openarm_step(), after=(restarted.name,))
     oldest, newest = platform_step(OLD_SUITE, minutes=2), platform_step(NEW_SUITE, "-k", NEW)
-    lane = [build, packages_step(), wheels_step(), oldest, newest, *plan_lab(form)]
+    lane = [packages_step(), wheels_step(), oldest, newest, *plan_lab(form)]
     others = [*plan_other_python(form), *plan_emulator(form)]
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
-    plan = [unit, *several, *in_a_row(lane, unit)]
+    plan = [unit, *several, build, *in_a_row(lane, build)]
     plan += [inside, restarted, arm, *in_a_row(others, arm), *queue]
     return [replace(one, longest=max(LEAST_LONGEST, PATIENCE * one.minutes)) for one in plan]
 
