@@ -45,7 +45,7 @@ from dora_systemd.runner.cell.begin import (
     nodes_environment,
 )
 from dora_systemd.runner.cell.boot import EarlyDaemon
-from dora_systemd.runner.cell.clock import Keepalive, StopClock
+from dora_systemd.runner.cell.clock import Keepalive, StopClock, Ticks, watchdog_seconds
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, say, words
@@ -132,6 +132,7 @@ class Runs:
     given: the options before links were resolved. unit: cgroup directory. environment: that of the
     nodes. check: dora's, for the first run. `beside`: tasks that outlast a run. clock: that of the
     stop that ends the last run. boot: dora's processes of the first run, if they exist already.
+    patience: seconds that dora's coordinator may take for an answer, None to watch nothing.
     """
 
     def __init__(
@@ -159,6 +160,8 @@ class Runs:
         self.beside = Beside(asyncio.get_running_loop())
         self.check = begun[1] if begun else DoraCheck(options, self.environment)
         self.rings: Rings | None = None
+        self.patience = watchdog_seconds(os.environ)
+        self.ticks = Ticks(self.patience)
 
     def keep_ring(self, inherited: int) -> None:
         """Keep the ring of the recorder, or give back one that is not needed. inherited: or -1."""
@@ -195,11 +198,10 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
         answer = partial(runs.rings.answer, others=answer)
     socket = serve(runs.paths.socket, answer, reach, role.sessions, role.door)
     beside.spawn("serve its socket", socket)
-    if "WATCHDOG_USEC" in os.environ:
-        seconds = int(os.environ["WATCHDOG_USEC"]) / SECOND / 3
-        beside.spawn("feed the watchdog", Keepalive(seconds).beat())
+    if runs.patience is not None:
+        beside.spawn("feed the watchdog", Keepalive(runs.ticks.seconds).beat(runs.ticks))
     if losses is not None:
-        beside.spawn("count what journald throws away", losses.run())
+        beside.spawn("count what journald throws away", losses.run(runs.ticks.wait))
     try:
         last = await run_once(runs, is_again=False)
         while goes_on(runs, last):
@@ -320,14 +322,15 @@ def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:
 def listen(runs: Runs, pump: Pump, dialogue: Dialogue) -> None:
     """Connect signals, timers and standard input to the pump."""
     loop, options, clock = asyncio.get_running_loop(), runs.reloader.options, runs.clock
+    # A head shows what members sample.
+    ticks = None if options.placed else runs.ticks
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         loop.add_signal_handler(number, partial(stop, pump, clock, number.name))
     if clock.by:  # the signal came between two runs
         loop.call_soon(stop, pump, clock, clock.by)
-    dialogue.spawn("take samples", dialogue.take_samples(SAMPLE_SECONDS))
-    if "WATCHDOG_USEC" in os.environ:
-        seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
-        dialogue.spawn("watch dora", dialogue.watch_dora(seconds))
+    dialogue.spawn("take samples", dialogue.take_samples(SAMPLE_SECONDS, ticks))
+    if runs.patience is not None:
+        dialogue.spawn("watch dora", dialogue.watch_dora(runs.ticks, runs.patience))
     timeout = runs.role.start_timeout
     if pump.cell.is_trial:
         timeout = min(timeout, runs.reloader.patience * SECOND)

@@ -22,6 +22,8 @@ BAD_LOOKS = {MEMORY: 1, CPU: 3}
 """Consecutive bad samples for an alarm: a starting program uses all the CPU time it can get."""
 GOOD_LOOKS = 6
 """Consecutive good samples after which a group is well again."""
+IDLE = 1.0
+"""Percent of one processor below which a dataflow without limits does nothing worth a sample."""
 QUIET = 300 * SECOND
 """µs between two reports of the same kind."""
 
@@ -99,6 +101,12 @@ def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms
                 reports.append(_report(event, key, load))
             after[key, event] = new
     return after, reports
+
+
+def is_quiet(loads: Mapping[str, Load]) -> bool:
+    """Whether the dataflow hardly uses CPU time, and no group has a limit that can be reached."""
+    has_limits = any(one.limit is not None or one.throttled is not None for one in loads.values())
+    return not has_limits and loads[WHOLE_CELL].cpu < IDLE
 
 
 def _judged(load: Load) -> list[tuple[str, bool, bool]]:

@@ -1,10 +1,16 @@
-"""Time in a cell: the clock of a stop, lost time, and the messages to the watchdog of systemd."""
+"""Time in a cell: the clock of a stop, lost time, and the messages to the watchdog of systemd.
+
+While nothing happens, the process wakes up at the ticks only, twice within WatchdogSec=, and each
+time once more for the answer of dora. Before Python 3.13 the thread for the watchdog wakes up, too.
+"""
 
 import asyncio
 import math
+import os
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from dora_systemd.adapters.host import notify
@@ -32,6 +38,38 @@ async def extend_timeout(extend: Callable[[int], object] = notify.extend_timeout
     while True:
         extend(round(3 * _EXTEND_SECONDS * SECOND))
         await asyncio.sleep(_EXTEND_SECONDS)
+
+
+_TICK_SECONDS = 15.0
+"""Longest time between two ticks, half of WatchdogSec= of our units."""
+
+
+def watchdog_seconds(environment: Mapping[str, str]) -> float | None:
+    """Return half of WatchdogSec=, see sd_watchdog_enabled(3); None without it."""
+    text = environment.get("WATCHDOG_USEC")
+    return int(text) / SECOND / 2 if text else None
+
+
+class Ticks:
+    """One timer for what is done from time to time, so that all of it costs one wakeup.
+
+    watchdog: of watchdog_seconds().
+    """
+
+    def __init__(self, watchdog: float | None = None) -> None:
+        self.seconds = min(watchdog or _TICK_SECONDS, _TICK_SECONDS)
+        self._due: asyncio.Event | None = None
+
+    async def wait(self) -> None:
+        """Wait for the next tick, for which other tasks may be waiting already."""
+        if self._due is None:
+            self._due = asyncio.Event()
+            asyncio.get_running_loop().call_later(self.seconds, self._end, self._due)
+        await self._due.wait()
+
+    def _end(self, due: asyncio.Event) -> None:
+        self._due = None
+        due.set()
 
 
 class Gaps:
@@ -92,11 +130,44 @@ class StopClock:
         return left
 
 
+if sys.version_info >= (3, 13):
+
+    class Alarm:
+        """Wakes a thread after 4/3 of `seconds` unless put off, and then every `seconds`."""
+
+        def __init__(self, seconds: float) -> None:
+            self._fd, self._seconds = os.timerfd_create(time.CLOCK_MONOTONIC), seconds
+
+        def put_off(self) -> None:
+            """Begin again."""
+            seconds = self._seconds
+            os.timerfd_settime(self._fd, initial=4 * seconds / 3, interval=seconds)
+
+        def wait(self) -> None:
+            """Wait until it is due."""
+            os.read(self._fd, 8)
+
+else:
+
+    class Alarm:
+        """Wakes a thread every `seconds`: this Python has no timer that can be put off."""
+
+        def __init__(self, seconds: float) -> None:
+            self._seconds = seconds
+
+        def put_off(self) -> None:
+            """Do nothing."""
+
+        def wait(self) -> None:
+            """Wait until it is due."""
+            time.sleep(self._seconds)
+
+
 PATIENCE_SECONDS = 120.0
 
 
 class Keepalive:
-    """Sends WATCHDOG=1 from its own thread, because anything in the event loop may be held up.
+    """Sends WATCHDOG=1, from its own thread if the event loop does not: anything may hold that up.
 
     A machine without time to spare, a disk or a kernel that keeps a call waiting: none of these is
     a reason to end healthy nodes. A runner that is stopped sends nothing, and so does one whose
@@ -110,27 +181,30 @@ class Keepalive:
         send: Callable[[], None] = notify.send_alive,
         patience: float = PATIENCE_SECONDS,
     ) -> None:
-        self._seconds = seconds
         self._send = send
         self._patience = patience
         self._beat = time.monotonic()
-        self._ended = threading.Event()
+        self._has_ended = False
+        self._alarm = Alarm(seconds)
 
-    async def beat(self) -> None:
+    async def beat(self, ticks: Ticks) -> None:
         """Send messages as long as the event loop runs. Returns only if cancelled."""
         threading.Thread(target=self._run, name="keepalive", daemon=True).start()
         try:
             while True:
+                self._alarm.put_off()
+                self._send()
                 self._beat = time.monotonic()
-                await asyncio.sleep(self._seconds)
+                await ticks.wait()
         finally:
             self._beat = time.monotonic()
 
     def end(self) -> None:
         """Send no more messages."""
-        self._ended.set()
+        self._has_ended = True
 
     def _run(self) -> None:
-        while not self._ended.wait(self._seconds):
-            if time.monotonic() - self._beat < self._patience:
+        while not self._has_ended:
+            self._alarm.wait()
+            if time.monotonic() - self._beat < self._patience and not self._has_ended:
                 self._send()

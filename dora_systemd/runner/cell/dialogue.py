@@ -23,7 +23,7 @@ from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.recorder.record import is_recorder
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.cell.clock import Gaps
+from dora_systemd.runner.cell.clock import Gaps, Ticks
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks, failed
 from dora_systemd.runner.cell.pump import Pump, now_us
@@ -295,8 +295,10 @@ class Dialogue(Tasks):
         if not self._engine.dismiss_daemon():
             self._pump.push(life.ChildExited(now_us(), "daemon", Exit(words="earlier")))
 
-    async def watch_dora(self, seconds: float) -> None:
-        """Check every `seconds` that neither coordinator nor daemon hangs.
+    async def watch_dora(self, ticks: Ticks, seconds: float) -> None:
+        """Check at each tick that neither coordinator nor daemon hangs.
+
+        seconds: timeout for the coordinator's answer.
 
         While the cell stops, TimeoutStopSec= bounds it. After a time in which the cell did not run,
         dora's processes have to find each other again.
@@ -304,16 +306,18 @@ class Dialogue(Tasks):
         gaps = Gaps(self._loop.time)
         while True:
             with gaps.within(seconds):
-                await asyncio.sleep(seconds)
+                await ticks.wait()
             if self._pump.cell.state is State.RUNNING and not gaps.is_recent:
-                with gaps.within(1.5 * seconds):
-                    silent = await self._engine.find_silent(1.5 * seconds)
+                with gaps.within(seconds):
+                    silent = await self._engine.find_silent(seconds)
                 if silent and not gaps.is_recent and self._pump.cell.state is State.RUNNING:
                     reason = f"the dora {silent} does not answer any more"
                     self._pump.push(life.ConnectionLost(now_us(), silent, reason))
 
-    async def take_samples(self, seconds: float) -> None:
-        """Sample the used CPU time every `seconds`."""
+    async def take_samples(self, seconds: float, ticks: Ticks | None = None) -> None:
+        """Sample the used CPU time every `seconds`, or at each tick while nothing happens."""
         while True:
-            self._pump.sample()
-            await asyncio.sleep(seconds)
+            if self._pump.sample() and ticks is not None:
+                await ticks.wait()
+            else:
+                await asyncio.sleep(seconds)

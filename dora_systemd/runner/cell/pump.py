@@ -38,7 +38,7 @@ from dora_systemd.decisions.life.states import (
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status, is_up
 from dora_systemd.decisions.logs.journal_events import END_EVENTS, NODE_END_EVENTS
-from dora_systemd.decisions.resources.usage import CpuSample, add_sample
+from dora_systemd.decisions.resources.usage import CpuSample, LineCount, add_sample
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.failure import failed, say
@@ -87,6 +87,7 @@ class Pump:
         self.end: asyncio.Future[RunnerExit] = self._loop.create_future()
         self._deadline: asyncio.TimerHandle | None = None
         self._samples: tuple[CpuSample, ...] = ()
+        self._lines: Mapping[str, LineCount] = {}  # at the last sample
         self._text = ""
         self._is_ready = False
         self._is_unwritten = False
@@ -223,17 +224,22 @@ class Pump:
         if becomes_ready:
             notify.send_ready()
 
-    def sample(self) -> None:
+    def sample(self) -> bool:
         """Add a sample of the CPU time used, so that `list` can show CPU% without waiting.
 
-        While the nodes run, also write events about CPU and memory pressure.
+        While the nodes run, also write events about CPU and memory pressure. Return whether nothing
+        happens: no line since the last sample, hardly any CPU time used, and no limit to watch.
         """
         sample = self._nodes.sample(time.monotonic_ns() // 1000)
+        lines, before = self._pipes.line_counts(), self._lines
+        is_quiet, self._lines = False, lines
         if self.cell.state is State.RUNNING:
             for record in self._nodes.resources.look(self._samples, sample):
                 self._record(record)
+            is_quiet = self._nodes.resources.is_quiet and lines == before
         self._samples = add_sample(self._samples, sample)
         self._write_table()
+        return is_quiet
 
     def refresh(self) -> None:
         """Write the table again, because the STATUS= of a node has changed."""

@@ -16,7 +16,7 @@ from dora_systemd.decisions.cell.log_backlog import Marks
 from dora_systemd.decisions.cell.owes import PROBE
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_owner, largest
-from dora_systemd.decisions.resources.pressure import Alarms, Load, Most, look
+from dora_systemd.decisions.resources.pressure import Alarms, Load, Most, is_quiet, look
 from dora_systemd.decisions.resources.usage import (
     WHOLE_CELL,
     CpuSample,
@@ -77,6 +77,8 @@ class Resources:
         self._alarms: Alarms = {}
         self._most: dict[str, Most] = {}
         self._clients = ClientWatch()
+        self.is_quiet = False
+        """Whether the groups hardly used CPU time before the last look(), and have no limit."""
 
     def explain(self, group: Path) -> Oom | None:
         """Find whether a process in a group has just been killed because of memory, and how."""
@@ -118,6 +120,7 @@ class Resources:
         loads = {key: _load(path, key, samples, now) for key, path in groups.items()}
         self._most |= {key: self._most.get(key, Most()).after(one) for key, one in loads.items()}
         self._alarms, reports = look(self._alarms, loads, now.at_us)
+        self.is_quiet = bool(samples) and is_quiet(loads)
         return [*(Record(*one) for one in reports), *self._clients.look(nodes)]
 
     def most(self, key: str) -> dict[str, str]:

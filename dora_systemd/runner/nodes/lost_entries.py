@@ -7,15 +7,15 @@ entries sent with the number stored.
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import scope_of
 
-CHECK_SECONDS = 30.0
-"""The default of RateLimitIntervalSec= of journald."""
+CHECK_TICKS = 2
+"""Ticks between two checks: together RateLimitIntervalSec= of journald, 30 s by default."""
 
 # Fewer entries than this cannot exceed a rate limit, so they are not counted.
 WORTH = 1000
@@ -52,10 +52,11 @@ class LossWatch:
         # Whether the last check found a difference that is not reported yet.
         self._is_open = False
 
-    async def run(self) -> None:
-        """Check every CHECK_SECONDS, forever."""
+    async def run(self, wait: Callable[[], Awaitable[None]]) -> None:
+        """Check every CHECK_TICKS, forever. wait: for the next tick."""
         while True:
-            await asyncio.sleep(CHECK_SECONDS)
+            for _ in range(CHECK_TICKS):
+                await wait()
             await self.check()
 
     async def check(self, tolerance: int = ON_ITS_WAY) -> None:

@@ -139,7 +139,7 @@ class FakeNodes(Nodes):
 
 
 class FakePipes(LogPipes):
-    """events: what was written. broken: life events that cannot be."""
+    """events: what was written. broken: life events that cannot be. lines: how many, by node."""
 
     def __init__(self, calls: Calls | None = None) -> None:
         super().__init__(asyncio.get_running_loop(), NoJournal(), Origin("robot", "uuid"))
@@ -147,6 +147,7 @@ class FakePipes(LogPipes):
         self.events: list[tuple[str, str | None, dict[str, Value]]] = []
         self.broken: set[str] = set()
         self.outputs: dict[str, OnLine] = {}
+        self.lines: dict[str, LineCount] = {}
 
     def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
         if name in self.broken:
@@ -155,7 +156,7 @@ class FakePipes(LogPipes):
         self.events.append((name, node, details))
 
     def line_counts(self) -> dict[str, LineCount]:
-        return {}
+        return self.lines
 
     def add_output(self, label: str, fd: int, on_line: OnLine = None, said: bytes = b"") -> None:
         del fd, said

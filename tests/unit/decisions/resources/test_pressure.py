@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -9,11 +10,13 @@ from dora_systemd.decisions.resources.pressure import (
     BAD_LOOKS,
     CPU,
     GOOD_LOOKS,
+    IDLE,
     MEMORY,
     QUIET,
     Alarms,
     Load,
     Report,
+    is_quiet,
     look,
 )
 from dora_systemd.values import SECOND
@@ -44,6 +47,22 @@ def test_memory_is_reported_at_once_and_once() -> None:
     assert report[2]["reason"] == "node a holds 950M of 1G, waiting 0% of the time"
     ((_, report),) = live(STALLED)
     assert report[2]["stalled"] == "40"
+
+
+@pytest.mark.parametrize(
+    ("whole", "node", "expected"),
+    [
+        (Load(cpu=IDLE / 2), Load(held=GIB), True),
+        (Load(cpu=IDLE), Load(), False),
+        (Load(cpu=IDLE / 2), WELL, False),
+        (Load(cpu=IDLE / 2), FLOWING, False),
+        (WELL, Load(), False),
+    ],
+)
+def test_nothing_happens_where_no_limit_can_be_reached(
+    whole: Load, node: Load, expected: bool
+) -> None:
+    assert is_quiet({"": whole, "a": node}) is expected
 
 
 def test_the_dataflow_has_no_node() -> None:

@@ -14,8 +14,16 @@ from dora_systemd.decisions.life.stop_budget import (
     unit_timeout,
 )
 from dora_systemd.decisions.unit.properties import stop_properties
-from dora_systemd.runner.cell.clock import BACKLOG_SECONDS, STOP_SECONDS, Keepalive, StopClock
+from dora_systemd.runner.cell.clock import (
+    BACKLOG_SECONDS,
+    STOP_SECONDS,
+    Keepalive,
+    StopClock,
+    Ticks,
+    watchdog_seconds,
+)
 from dora_systemd.values import INFINITY, SECOND
+from tests.unit.fakes.loop import live
 
 OPTIONS = RunnerOptions("r", "u", "/f.yml", "/", "/dora")
 
@@ -89,12 +97,74 @@ def test_endless_grace() -> None:
     assert clock.left(7.0) == 7.0
 
 
+@pytest.mark.parametrize(
+    ("environment", "watchdog", "seconds"),
+    [
+        ({"WATCHDOG_USEC": "30000000"}, 15.0, 15.0),
+        ({"WATCHDOG_USEC": "5000000"}, 2.5, 2.5),
+        ({"WATCHDOG_USEC": "600000000"}, 300.0, 15.0),
+        ({}, None, 15.0),
+    ],
+)
+def test_a_tick_is_half_of_the_watchdog(
+    environment: dict[str, str], watchdog: float | None, seconds: float
+) -> None:
+    assert watchdog_seconds(environment) == watchdog
+    assert Ticks(watchdog).seconds == seconds
+
+
+def test_all_that_waits_for_a_tick_is_one_wakeup() -> None:
+    async def work() -> None:
+        loop, ticks = asyncio.get_running_loop(), Ticks(10.0)
+        woken: list[float] = []
+
+        async def wait(before: float) -> None:
+            await asyncio.sleep(before)
+            for _ in range(2):
+                await ticks.wait()
+                woken.append(loop.time())
+
+        begun = loop.time()
+        await asyncio.gather(*(wait(seconds) for seconds in (0.0, 3.0, 9.0)))
+        assert [at - begun for at in woken] == [10.0] * 3 + [20.0] * 3
+
+    live(work)
+
+
+def test_a_task_that_gives_up_leaves_the_tick_to_the_others() -> None:
+    async def work() -> None:
+        loop, ticks = asyncio.get_running_loop(), Ticks(10.0)
+        first = asyncio.create_task(ticks.wait())
+        await asyncio.sleep(1)
+        first.cancel()
+        await ticks.wait()
+        assert loop.time() == 10.0
+
+    live(work)
+
+
+def test_a_loop_that_runs_sends_by_itself() -> None:
+    senders: list[threading.Thread] = []
+    keepalive = Keepalive(60, lambda: senders.append(threading.current_thread()))
+
+    async def work() -> None:
+        task = asyncio.create_task(keepalive.beat(Ticks(0.01)))
+        async with asyncio.timeout(60):
+            while len(senders) < 3:
+                await asyncio.sleep(0)
+        task.cancel()
+
+    asyncio.run(work())
+    keepalive.end()
+    assert set(senders) == {threading.current_thread()}
+
+
 def test_a_loop_that_is_held_up_is_alive_for_a_while() -> None:
     sent = threading.Semaphore(0)
     keepalive = Keepalive(0.01, sent.release)
 
     async def work() -> None:
-        task = asyncio.create_task(keepalive.beat())
+        task = asyncio.create_task(keepalive.beat(Ticks(0.01)))
         await asyncio.sleep(0)
         for _ in range(3):
             assert sent.acquire(timeout=20), "the loop stands still meanwhile"
@@ -110,7 +180,7 @@ def test_a_loop_that_hangs_is_not_alive() -> None:
     keepalive = Keepalive(0.01, lambda: sent.append(time.monotonic()), patience=0.3)
 
     async def work() -> float:
-        task = asyncio.create_task(keepalive.beat())
+        task = asyncio.create_task(keepalive.beat(Ticks(0.01)))
         await asyncio.sleep(0)
         begun = time.monotonic()
         time.sleep(1)
@@ -126,7 +196,7 @@ def test_a_runner_that_exits_does_not_wait_for_it() -> None:
     keepalive = Keepalive(0.01, lambda: None)
 
     async def work() -> None:
-        task = asyncio.create_task(keepalive.beat())
+        task = asyncio.create_task(keepalive.beat(Ticks(0.01)))
         await asyncio.sleep(0)
         own = [one for one in threading.enumerate() if one.name == "keepalive"]
         assert own

@@ -19,7 +19,8 @@ from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.recorder.record import RECORDER
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.errors import DoraSystemdError
-from tests.unit.fakes.dialogue import DESCRIPTOR, OPTIONS, Bench
+from dora_systemd.runner.cell.clock import Ticks
+from tests.unit.fakes.dialogue import DESCRIPTOR, OPTIONS, Bench, Heard
 from tests.unit.fakes.loop import ImpatientLoop, live, settle
 from tests.unit.fakes.manager import with_texts
 
@@ -309,7 +310,7 @@ def test_dora_is_watched(
     async def work() -> None:
         bench = Bench(tmp_path, state)
         bench.dora.silent = silent
-        bench.dialogue.spawn("watch dora", bench.dialogue.watch_dora(10))
+        bench.dialogue.spawn("watch dora", bench.dialogue.watch_dora(Ticks(10), 15))
         await asyncio.sleep(15)
         assert bench.heard == wanted
         assert (("find silent", 15.0) in bench.calls) is (state is State.RUNNING)
@@ -325,7 +326,7 @@ def test_a_cell_that_was_frozen_gives_dora_time(tmp_path: Path) -> None:
         bench = Bench(tmp_path, State.RUNNING)
         bench.dora.silent = "daemon"
         loop = cast(ImpatientLoop, asyncio.get_running_loop())
-        bench.dialogue.spawn("watch dora", bench.dialogue.watch_dora(10))
+        bench.dialogue.spawn("watch dora", bench.dialogue.watch_dora(Ticks(10), 15))
         await asyncio.sleep(9)
         loop.jump(40)
         await asyncio.sleep(35)
@@ -337,11 +338,41 @@ def test_a_cell_that_was_frozen_gives_dora_time(tmp_path: Path) -> None:
     live(work)
 
 
+class Sampled(Heard):
+    """A pump in which nothing happens but at some samples."""
+
+    def sample(self) -> bool:
+        self.at.append(asyncio.get_running_loop().time())
+        return len(self.at) not in self.busy
+
+    at: list[float]
+    busy: set[int]
+
+
+@pytest.mark.parametrize(
+    ("ticks", "at"), [(15.0, [0, 5, 10, 25, 40, 45]), (None, [0, 5, 10, 15, 20, 25])]
+)
+def test_samples_wait_for_ticks_while_nothing_happens(
+    tmp_path: Path, ticks: float | None, at: list[float]
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, kind=Sampled)
+        assert isinstance(bench.pump, Sampled)
+        bench.pump.at, bench.pump.busy = [], {1, 2, 5}
+        shared = None if ticks is None else Ticks(ticks)
+        bench.dialogue.spawn("take samples", bench.dialogue.take_samples(5, shared))
+        await asyncio.sleep(46)
+        assert bench.pump.at[:6] == at
+        bench.dialogue.cancel()
+
+    live(work)
+
+
 def test_what_is_still_asked_is_given_up(tmp_path: Path) -> None:
     async def work() -> None:
         bench, before = Bench(tmp_path), asyncio.all_tasks()
         await bench.do(Do.ASK_SPAWN)
-        bench.dialogue.spawn("take samples", bench.dialogue.take_samples(5))
+        bench.dialogue.spawn("take samples", bench.dialogue.take_samples(5, Ticks()))
         await settle()
         bench.dialogue.cancel()
         await settle()

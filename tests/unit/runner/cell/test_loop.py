@@ -38,7 +38,7 @@ class Side:
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.replies: list[Reply] = []
         self.hangs = False
-        self.resources = SimpleNamespace(look=lambda *_: [], most=lambda _: {})
+        self.resources = SimpleNamespace(look=lambda *_: [], most=lambda _: {}, is_quiet=False)
         self.notify_sockets = None
         self.stop_dues: dict[str, int] = {}
 

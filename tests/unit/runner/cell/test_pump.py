@@ -17,6 +17,7 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import Cell, Do, Record, State
+from dora_systemd.decisions.resources.usage import LineCount
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.cell.restarts import Life
@@ -308,6 +309,29 @@ def test_samples_and_what_is_said_about_them(tmp_path: Path, state: State, count
         bench.pump.sample()
         assert [name for name, *_ in bench.pipes.events] == ["memory-high"] * count
         assert len(bench.table["samples"]) == 1
+
+    live(work)
+
+
+@pytest.mark.parametrize(
+    ("state", "is_idle", "lines", "is_quiet"),
+    [
+        (State.RUNNING, True, 0, True),
+        (State.RUNNING, True, 1, False),
+        (State.RUNNING, False, 0, False),
+        (State.WAITING, True, 0, False),
+    ],
+)
+def test_a_sample_says_whether_anything_happens(
+    tmp_path: Path, state: State, is_idle: bool, lines: int, is_quiet: bool
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, state)
+        bench.pipes.lines = {"a": LineCount(written=5)}
+        assert not bench.pump.sample(), "the first one knows nothing of what was before"
+        bench.nodes.resources.is_quiet = is_idle
+        bench.pipes.lines = {"a": LineCount(written=5 + lines)}
+        assert bench.pump.sample() is is_quiet
 
     live(work)
 

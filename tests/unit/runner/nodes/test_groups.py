@@ -84,6 +84,23 @@ def test_the_most_that_a_group_has_used(unit: Path) -> None:
     assert resources.most("b") == {}, "no memory.stat, and no CPU time"
 
 
+def test_groups_that_do_nothing_and_have_no_limit(unit: Path) -> None:
+    resources = Resources(unit)
+    for group in (unit, unit / "node-a", unit / "node-b"):
+        (group / "memory.max").write_text("max\n")
+    first, second = CpuSample(0, {"": 0}), CpuSample(5_000_000, {"": 40_000})
+
+    def is_quiet(now: CpuSample, *before: CpuSample) -> bool:
+        resources.look(before, now)
+        return resources.is_quiet
+
+    assert not is_quiet(first), "nothing is known before the first sample"
+    assert is_quiet(second, first)
+    assert not is_quiet(CpuSample(10_000_000, {"": 100_000}), second)
+    (unit / "node-b/memory.high").write_text(f"{MIB}\n")
+    assert not is_quiet(second, first)
+
+
 def test_the_limit_that_throttles(unit: Path) -> None:
     resources = Resources(unit)
     (unit / "node-b/cpu.max").write_text("150000 100000\n")

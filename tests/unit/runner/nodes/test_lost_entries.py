@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.nodes.lost_entries import LossWatch
+from dora_systemd.runner.nodes.lost_entries import CHECK_TICKS, LossWatch
 
 
 class Case:
@@ -35,6 +35,20 @@ class Case:
     def finish(self, now: int, sent: int, stored: int) -> None:
         self.now, self.sent, self.stored = now, sent, stored
         asyncio.run(self.watch.finish())
+
+
+def test_it_checks_at_every_second_tick() -> None:
+    case, ticks = Case(), 0
+
+    async def wait() -> None:
+        nonlocal ticks
+        ticks, case.sent = ticks + 1, case.sent + 5000
+        if ticks > 2 * CHECK_TICKS:
+            raise asyncio.CancelledError
+
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(case.watch.run(wait))
+    assert len(case.windows) == 2
 
 
 def test_a_quiet_dataflow_is_not_looked_at() -> None:
