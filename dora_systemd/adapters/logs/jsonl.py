@@ -3,6 +3,9 @@
 The daemon appends to log_<node>.jsonl, over restarts too. It may rotate the file: then it becomes
 log_<node>.1.jsonl, that one .2, and so on. The inodes show a rotation. No line is read twice or
 missed as long as dora keeps one file more than it fills between two reads.
+
+A file is polled while dora writes to it: to be woken by each write would cost more. A file that
+rests is read again when wake() is called, after the next change.
 """
 
 import asyncio
@@ -14,6 +17,8 @@ from pathlib import Path
 from dora_systemd.decisions.logs.lines import LineSplitter, Value, jsonl_fields
 
 POLL_SECONDS = 0.05
+QUIET_POLLS = 20
+"""Polls without anything new after which a file rests."""
 # Bytes to read before the loop does other work.
 CHUNK = 1 << 16
 MAX_ROTATED = 1000
@@ -33,7 +38,8 @@ class JsonlTail:
     line. is_busy: while true nothing is read, and the lines stay in the file. place: a file that
     notes up to where the journal has the lines; see resume_tail(). watch: called at each read with
     the number of unread bytes. lost_files: how often dora deleted a rotated file before it was
-    read.
+    read. rests: whether nothing is read before wake(). on_quiet: called before the file rests;
+    whether wake() is called after any change that follows.
     """
 
     def __init__(
@@ -54,6 +60,8 @@ class JsonlTail:
         self._lines = LineSplitter(LINE_LIMIT)
         self._fd = -1
         self._timer: asyncio.TimerHandle | None = None
+        self.on_quiet: Callable[[], bool] = lambda: False
+        self._quiet_polls, self._is_watched, self.rests = 0, False, False
         self._place = -1 if place is None else os.open(place, _PLACE_FLAGS, 0o600)
         self._noted = b""
 
@@ -64,7 +72,25 @@ class JsonlTail:
         has_more = not is_busy and self._read_chunk() > 0
         self._note_place()
         self._watch(self.backlog() if is_busy or has_more else 0)
-        self._timer = self._loop.call_later(0 if has_more else POLL_SECONDS, self.start)
+        self.rests = self._may_rest(is_quiet=not (is_busy or has_more))
+        if not self.rests:
+            self._timer = self._loop.call_later(0 if has_more else POLL_SECONDS, self.start)
+
+    def wake(self) -> None:
+        """Read on, because dora may have written something."""
+        self._quiet_polls = 0
+        if self.rests:
+            self.start()
+
+    def _may_rest(self, is_quiet: bool) -> bool:
+        """Whether this poll is the last one. One more follows on_quiet(), so nothing is missed."""
+        self._quiet_polls = self._quiet_polls + 1 if is_quiet else 0
+        if self._quiet_polls == QUIET_POLLS:
+            self._is_watched = self.on_quiet()
+        elif self._quiet_polls > QUIET_POLLS:
+            self._quiet_polls = 0
+            return self._is_watched
+        return False
 
     def drain(self) -> bool:
         """Read what the file contains now, within a limit; return whether there was anything."""
@@ -75,6 +101,7 @@ class JsonlTail:
 
     def close(self) -> None:
         """Read what the file contains, and stop following it."""
+        self.rests = False
         if self._timer is not None:
             self._timer.cancel()
         while self._read_chunk():

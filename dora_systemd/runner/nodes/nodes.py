@@ -31,6 +31,7 @@ from dora_systemd.runner.nodes.launcher_gates import Gates
 
 if TYPE_CHECKING:
     from dora_systemd.decisions.watchdog.messages import Sign
+    from dora_systemd.runner.nodes.log_changes import LogChanges
     from dora_systemd.runner.nodes.watchdog import NotifySockets
 
 _GONE_SECONDS = 0.05
@@ -53,6 +54,7 @@ class Nodes:
         self._bare: set[str] = set()
         self._limited: set[str] = set()
         self._tails: dict[str, JsonlTail | None] = {}
+        self._log_changes: LogChanges | None = None
         self._holds: dict[str, Hold] = {}
         self.resources = Resources(unit)
         self.notify_sockets = _notify_sockets(watchdogs, unit, paths, pipes) if watchdogs else None
@@ -164,15 +166,27 @@ class Nodes:
         raise_file_limit()
         for node in self._piped:
             self._pipes.open(node)
+        directory = self._paths.work / "out" / run
+        if self._tails:
+            # Imported late: most nodes have pipes.
+            from dora_systemd.runner.nodes.log_changes import LogChanges
+
+            self._log_changes = LogChanges(directory, self._wake_tails)
         loop = asyncio.get_running_loop()
         for node in self._tails:
-            path = self._paths.work / "out" / run / f"log_{node}.jsonl"
+            path = directory / f"log_{node}.jsonl"
             put = partial(self._pipes.write_fields, node=node)
             is_busy = partial(self._pipes.is_busy, node)
             place, watch = self._paths.node_place(node), partial(self._watch_backlog, node)
             tail = JsonlTail(loop, path, put, is_busy, place, watch)
+            if self._log_changes:
+                tail.on_quiet = self._log_changes.watch
             self._tails[node] = tail
             tail.start()
+
+    def _wake_tails(self) -> None:
+        for tail in filter(None, self._tails.values()):
+            tail.wake()
 
     def _watch_backlog(self, node: str, backlog: int) -> None:
         # The node may have been removed and added again: then this is a new Hold.
@@ -282,6 +296,9 @@ class Nodes:
         self.gates.remove()
         self._holds.clear()
         self._tails.clear()
+        if self._log_changes:
+            self._log_changes.close()
+            self._log_changes = None
 
     def drain(self, nodes: Iterable[str], is_live: bool = False) -> None:
         """Queue what `nodes` have written so far, before whatever is written next.

@@ -153,8 +153,8 @@ LATE = {
             *("decisions.cell.machines", "decisions.cell.status"),
         },
     },
-    "most dataflows have no notify sockets, and no node has rights or owes anything": {
-        "runner.nodes.nodes": {"runner.nodes.watchdog"},
+    "most nodes have pipes and no notify socket, and no node has rights or owes anything": {
+        "runner.nodes.nodes": {"runner.nodes.watchdog", "runner.nodes.log_changes"},
         "runner.cell.dialogue": {"runner.nodes.watchdog"},
         "verbs.facts.list": {
             *("decisions.watchdog.messages", "decisions.cell.owes", "decisions.cell.rights"),

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.adapters.logs.jsonl import POLL_SECONDS, JsonlTail, resume_tail
+from dora_systemd.adapters.logs.jsonl import POLL_SECONDS, QUIET_POLLS, JsonlTail, resume_tail
 from dora_systemd.decisions.logs.lines import Value
 
 
@@ -272,6 +272,68 @@ def test_waits_while_the_journal_is_busy(tmp_path: Path) -> None:
         follower.close()
 
     asyncio.run(scenario())
+
+
+def poll(follower: JsonlTail, count: int) -> None:
+    """Let so many intervals pass at once."""
+    for _ in range(count):
+        follower.start()
+
+
+@pytest.mark.parametrize("is_watched", [True, False])
+def test_a_file_that_rests_is_not_polled(
+    loop: asyncio.AbstractEventLoop, tmp_path: Path, is_watched: bool
+) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    asked: list[int] = []
+
+    def watch() -> bool:
+        asked.append(dora.count)
+        return is_watched
+
+    follower.on_quiet = watch
+    dora.write()
+    poll(follower, QUIET_POLLS)
+    assert asked == [], "the first poll has found a line"
+    poll(follower, 1)
+    assert asked == [1]
+    assert not follower.rests, "one more poll finds what came before the watch"
+    poll(follower, 1)
+    assert follower.rests is is_watched
+    dora.write()
+    follower.wake()
+    poll(follower, 1)
+    assert found == numbers(2)
+    assert not follower.rests
+    follower.close()
+
+
+def test_a_line_that_comes_while_the_watch_begins(
+    loop: asyncio.AbstractEventLoop, tmp_path: Path
+) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+
+    def watch() -> bool:
+        dora.write()
+        return True
+
+    follower.on_quiet = watch
+    poll(follower, QUIET_POLLS + 1)
+    assert found == numbers(1)
+    assert not follower.rests
+    follower.close()
+
+
+def test_a_journal_that_is_busy_lets_no_file_rest(
+    loop: asyncio.AbstractEventLoop, tmp_path: Path
+) -> None:
+    follower = JsonlTail(loop, Dora(tmp_path).path, lambda _: None, lambda: True)
+    follower.on_quiet = lambda: True
+    poll(follower, 3 * QUIET_POLLS)
+    assert not follower.rests
+    follower.close()
 
 
 class Watched(PosixPath):
