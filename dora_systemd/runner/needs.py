@@ -2,7 +2,8 @@
 
 A thread checks the paths, because a file system may hang. The thread checks them when a parent
 directory of a path or a network interface changes, and every _LOOK_SECONDS: not all file systems
-report changes, nor do all CAN drivers. The decisions are in decisions/needs/steps.py, the gates in
+report changes or mounts, nor do all CAN drivers. For devices in /dev, of which the kernel reports
+all, the thread rests until a change. The decisions are in decisions/needs/steps.py, the gates in
 runner/nodes/launcher_gates.py.
 """
 
@@ -16,12 +17,13 @@ from dora_systemd.adapters.host.inotify import Inotify
 from dora_systemd.adapters.host.presence import (
     LinkChanges,
     Presence,
+    are_devices,
     look_at,
     look_at_link,
     watched_places,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.status import LATCHED
+from dora_systemd.decisions.cell.status import LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
@@ -59,10 +61,12 @@ class Watch:
         source.drain()
         self._event.set()
 
-    def set_places(self, directories: Iterable[str]) -> None:
-        """Watch these directories instead of those before; a thread may call this."""
-        if self._inotify is not None:
-            self._inotify.watch(directories)
+    def set_places(self, directories: Iterable[str]) -> set[str]:
+        """Watch these directories instead of those before; return those that are watched.
+
+        A thread may call this.
+        """
+        return set() if self._inotify is None else self._inotify.watch(directories)
 
     def clear(self) -> None:
         """Forget the changes so far."""
@@ -72,8 +76,8 @@ class Watch:
         """Make the task check again."""
         self._event.set()
 
-    async def wait(self, seconds: float) -> None:
-        """Wait for a change, at most `seconds`."""
+    async def wait(self, seconds: float | None) -> None:
+        """Wait for a change, at most `seconds`, None for any time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._event.wait()
@@ -110,6 +114,7 @@ def wait_for_needs(run: Run, options: RunnerOptions, definition: Definition, spa
     needs = Needs(run, options, definition, spawn)
     spawn("wait for what nodes need", needs.work())
     spawn("see whether failed nodes lack something", needs.follow())
+    spawn("see what becomes of the nodes with needs", needs.see_changes())
 
 
 class Needs:
@@ -128,7 +133,11 @@ class Needs:
 
         every = {one for needs in self._needs.values() for one in needs}
         self._paths = {one for one in every if not one.startswith(NET)}
-        self._watch = Watch(has_links=every != self._paths)
+        self._has_links = every != self._paths
+        self._watch = Watch(self._has_links)
+        self._are_seen = False  # whether each change of the paths wakes the task
+        self._is_undone = False  # whether a step has to be taken later
+        self._seen = self._states(run.pump.cell)
 
     async def follow(self) -> None:
         """Check the needs again when a node has failed: dora would use up its restarts.
@@ -145,6 +154,16 @@ class Needs:
                     self._closed.add(node)
             self._watch.wake()
 
+    async def see_changes(self) -> None:
+        """Check the needs again when the state of a node changes."""
+        pump = self._run.pump
+        while await pump.wait(lambda cell: self._states(cell) != self._seen, None):
+            self._seen = self._states(pump.cell)
+            self._watch.wake()
+
+    def _states(self, cell: Cell) -> tuple[State, list[NodeStatus | None]]:
+        return cell.state, [*map(cell.nodes.get, self._needs)]
+
     def _failed(self, cell: Cell) -> set[tuple[str, int]]:
         """The nodes that have failed, and since when."""
         nodes = ((node, cell.nodes[node]) for node in self._needs.keys() & cell.nodes.keys())
@@ -156,12 +175,16 @@ class Needs:
             while await self._run.pump.wait(lambda cell: cell.state in _STATES, None):
                 self._watch.clear()
                 self._act(await asyncio.to_thread(self._look))
-                await self._watch.wait(_LOOK_SECONDS)
+                may_rest = self._are_seen and not self._is_undone
+                await self._watch.wait(None if may_rest else _LOOK_SECONDS)
                 await asyncio.sleep(_PAUSE_SECONDS)
 
     def _look(self) -> dict[str, list[Presence]]:
         # Watch first: what changes after the look is not missed then.
-        self._watch.set_places(watched_places(self._paths))
+        places = watched_places(self._paths)
+        is_complete = self._watch.set_places(places) == places
+        is_local = are_devices(self._paths, places) and not self._has_links
+        self._are_seen = is_complete and is_local
         return {node: [*map(check, needs)] for node, needs in self._needs.items()}
 
     def _act(self, found: Mapping[str, list[Presence]]) -> None:
@@ -172,9 +195,12 @@ class Needs:
         is_running = cell.state is State.RUNNING
         # A requested stop of a node closes its gate, too.
         passed = frozenset(one for one in self._passed if self._is_through(one))
+        self._is_undone = False
         for step in list(need_steps(cell.nodes, missing, is_running, passed)):
             if step.node not in self._losing and not self._run.lock.locked():
                 self._take(step, found[step.node])
+            else:
+                self._is_undone = True
 
     def _is_through(self, node: str) -> bool:
         return node in self._closed or self._run.nodes.gates.is_passing(node)

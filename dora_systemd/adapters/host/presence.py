@@ -62,6 +62,15 @@ def watched_places(paths: Iterable[str]) -> set[str]:
     return {place for path in paths for place in _places(path)}
 
 
+def are_devices(paths: Iterable[str], places: Iterable[str]) -> bool:
+    """Whether all paths are in /dev, also behind their links. places: of watched_places().
+
+    No other machine changes anything there, and nothing is mounted over a device.
+    """
+    every = (*paths, *(one for one in places if one != "/"))
+    return all(f"{one}/".startswith("/dev/") for one in every)
+
+
 def _places(path: str) -> set[str]:
     found: set[str] = set()
     for _ in range(_MOST_LINKS):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.host.presence import look_at, watched_places
+from dora_systemd.adapters.host.presence import are_devices, look_at, watched_places
 from dora_systemd.runner.needs import Watch
 
 LONG = 60.0
@@ -88,6 +88,33 @@ def test_use_of_a_file_wakes_nobody(tmp_path: Path) -> None:
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.2):
                 await watch.wait(LONG)
+        watch.close()
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("/dev/null", True),
+        ("/dev/no-such-directory/a/b", True),
+        ("/dev/fd/0", False),
+        ("/tmp/x", False),
+        ("/develop", False),
+    ],
+)
+def test_devices(path: str, expected: bool) -> None:
+    """/dev/fd is a link to /proc, where inotify reports nothing."""
+    assert are_devices([path], watched_places([path])) is expected
+    both = [path, "/dev/null"]
+    assert are_devices(both, watched_places(both)) is expected
+
+
+def test_what_is_watched_is_known(tmp_path: Path) -> None:
+    async def scene() -> None:
+        watch = Watch()
+        there, absent = str(tmp_path), str(tmp_path / "absent")
+        assert watch.set_places([there, absent]) == {there}
         watch.close()
 
     asyncio.run(scene())
