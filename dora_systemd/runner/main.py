@@ -57,7 +57,6 @@ from dora_systemd.runner.cell.restarts import (
     begin_life,
     find_spent,
     forget_restarts,
-    hold_back,
     learn_first,
 )
 from dora_systemd.runner.nodes.lost_entries import LossWatch, losses_of_user
@@ -322,6 +321,7 @@ def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:
 def listen(runs: Runs, pump: Pump, dialogue: Dialogue) -> None:
     """Connect signals, timers and standard input to the pump."""
     loop, options, clock = asyncio.get_running_loop(), runs.reloader.options, runs.clock
+    dialogue.hold = runs.this_life.hold
     # A head shows what members sample.
     ticks = None if options.placed else runs.ticks
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -382,9 +382,7 @@ def run(argv: list[str], begun: Begun | None) -> int:
         if not directory:
             hint = "it is started by systemd: use `doractl start`"
             raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
-        paths = CellPaths(Path(directory))
-        hold_back(options, paths)
-        return run_loop(run_cell(options, paths, begun))
+        return run_loop(run_cell(options, CellPaths(Path(directory)), begun))
     except DoraSystemdError as error:
         say(f"{error.message}\n{error.hint}".strip())
         return refusal_exit(error)

@@ -26,7 +26,7 @@ MIN_DELAY = SECOND // 2
 
 HEAD_START = 2 * SECOND // 5
 """µs. systemd starts the runner this long before the delay of a restart is over, and the runner
-holds the nodes back: the sandbox, Python and dora's coordinator are ready by then. What is left of
+holds the nodes back: the sandbox, Python and dora are ready by then. What is left of
 the shortest delay is systemd's own default, for a runner that does not get that far."""
 
 MAX_RESTARTS = 1_000_000

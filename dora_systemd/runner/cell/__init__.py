@@ -7,7 +7,7 @@ refuses the dataflow, STATUS= has the reason, and the exit status depends on the
 (`decisions/life/refusal.py`).
 
 Before a restart systemd waits for the shortest delay without its last 400 ms, and `restarts.py` for
-the rest, in which the sandbox, Python and the coordinator get ready. The runner refuses the restart
+the rest, in which all gets ready that comes before the nodes. The runner refuses the restart
 that would exceed the budget (exit status 75): systemd's StartLimitBurst= counts starts by hand as
 well, so it is larger, for lives that end before the runner.
 """

@@ -27,6 +27,7 @@ from dora_systemd.runner.cell.clock import Gaps, Ticks
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks, failed
 from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.cell.restarts import Hold, no_hold
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
@@ -47,7 +48,10 @@ there is time between the two."""
 
 
 class Dialogue(Tasks):
-    """Carries out each Do; every answer becomes an event of the pump."""
+    """Carries out each Do; every answer becomes an event of the pump.
+
+    hold: waits until the nodes may start.
+    """
 
     def __init__(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
@@ -58,6 +62,7 @@ class Dialogue(Tasks):
         self._engine = dora
         self._nodes = nodes
         self._pipes = pipes
+        self.hold: Hold = no_hold
         self._loop = asyncio.get_running_loop()
         self._exits: dict[str, tuple[life.NodeExited, asyncio.TimerHandle]] = {}
 
@@ -144,6 +149,7 @@ class Dialogue(Tasks):
 
     async def _wait_joined(self) -> None:
         await self._engine.wait_joined()
+        await self.hold()  # all that comes before the nodes is done within a delay
         self._pump.push(life.DaemonConnected(now_us()))
 
     async def _send_start(self, descriptor: Mapping[str, Any]) -> None:

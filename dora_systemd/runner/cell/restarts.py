@@ -16,9 +16,10 @@ Most imports are late: they take longer than everything before the coordinator.
 import contextlib
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -32,6 +33,9 @@ from dora_systemd.errors import DoraSystemdError, RestartsSpent
 from dora_systemd.names import unit_name
 from dora_systemd.paths import CellPaths, request_file
 from dora_systemd.values import INFINITY, SECOND, format_duration
+
+Hold = Callable[[], Coroutine[Any, Any, None]]
+"""Waits until the nodes may start."""
 
 _ASK_SECONDS = 5.0
 _MOST_SECONDS = 1.0
@@ -101,22 +105,43 @@ def _now_us() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
 
 
-def hold_back(options: RunnerOptions, paths: CellPaths, old: float | None = None) -> None:
-    """Wait for the rest of a short delay: at most HEAD_START, from when systemd began this process.
+def held_until(options: RunnerOptions, is_user: bool, old: float | None = None) -> float:
+    """Return when the rest of a short delay is over, CLOCK_MONOTONIC seconds.
 
-    A start, also after a requested stop, has no lives before it, and waits for nothing. old:
-    seconds since systemd began this process, None to read the time from the kernel.
+    That is at most HEAD_START from when systemd began this process. A start, also after a requested
+    stop, has no lives before it, and waits for nothing: 0. old: seconds since systemd began this
+    process, None to read the time from the kernel.
     """
+    now = time.clock_gettime(time.CLOCK_MONOTONIC)
+    if (seconds := HEAD_START / SECOND - (age() if old is None else old)) <= 0:
+        return 0.0
+    # systemd's timers are up to 250 ms late, and the delay begins before ExecStopPost=.
+    ended = asked("ActiveExitTimestampMonotonic", options.name, is_user, 0)
+    since, delay = now - ended / SECOND, restart_of(options).delay / SECOND
+    # After more than that it was another life, and the last one never became active.
+    known = delay - since if since < delay + _MOST_SECONDS else seconds
+    return now + max(min(seconds, known), 0)
+
+
+async def no_hold() -> None:
+    """Wait for nothing, because no delay has to pass."""
+
+
+def begin_hold(options: RunnerOptions, is_user: bool) -> Hold:
+    """Return what waits for held_until(), which a thread computes meanwhile."""
     if not fd_store.lives():
-        return
-    if (seconds := HEAD_START / SECOND - (age() if old is None else old)) > 0:
-        # systemd's timers are up to 250 ms late, and the delay begins before ExecStopPost=.
-        ended = asked("ActiveExitTimestampMonotonic", options.name, paths.is_of_user, 0)
-        since = time.clock_gettime(time.CLOCK_MONOTONIC) - ended / SECOND
-        delay = restart_of(options).delay / SECOND
-        # After more than that it was another life, and the last one never became active.
-        known = delay - since if since < delay + _MOST_SECONDS else seconds
-        time.sleep(max(min(seconds, known), 0))
+        return no_hold
+    import asyncio
+
+    from dora_systemd.adapters.host.process import beside
+
+    moment = beside(partial(held_until, options, is_user))
+
+    async def hold() -> None:
+        until = await asyncio.wrap_future(moment)
+        await asyncio.sleep(max(until - time.clock_gettime(time.CLOCK_MONOTONIC), 0))
+
+    return hold
 
 
 def age() -> float:
@@ -202,10 +227,17 @@ def _transient(name: str, is_user: bool) -> Path:
 class Life:
     """The time between two starts of the unit: the same for all its runs."""
 
-    def __init__(self, uuid: str, is_first: bool = False, may_be_first: bool = False) -> None:
+    def __init__(
+        self,
+        uuid: str,
+        is_first: bool = False,
+        may_be_first: bool = False,
+        hold: Hold = no_hold,
+    ) -> None:
         self.uuid = uuid  # of the dataflow
         self.is_first = is_first  # systemd has certainly not restarted the unit
         self.may_be_first = may_be_first  # only systemd knows that
+        self.hold = hold
         self.up_us = 0  # CLOCK_MONOTONIC, as ActiveEnterTimestampMonotonic=; 0 before that
 
     def become_up(self) -> None:
@@ -215,8 +247,9 @@ class Life:
 
 def begin_life(options: RunnerOptions, is_user: bool) -> Life:
     """Return the life that begins with this process."""
+    hold = begin_hold(options, is_user)
     is_first = is_first_life(restart_of(options), options.name, is_user)
-    return Life(options.uuid, is_first, not is_first and fd_store.is_first_life())
+    return Life(options.uuid, is_first, not is_first and fd_store.is_first_life(), hold)
 
 
 async def learn_first(life: Life, name: str, is_user: bool, seconds: float = ASK_SECONDS) -> None:

@@ -368,6 +368,31 @@ def test_samples_wait_for_ticks_while_nothing_happens(
     live(work)
 
 
+def test_a_restart_is_ready_before_its_delay_is_over(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.JOINING)
+        is_over = asyncio.Event()
+
+        async def hold() -> None:
+            await is_over.wait()
+
+        bench.dialogue.hold = hold
+        child = engine.spawn("daemon", ["/bin/cat"], {}, tmp_path)
+        bench.dora.daemon = lambda _: child
+        bench.actions[Do.START_DAEMON]()
+        bench.dora.joined.set()
+        await settle()
+        assert life.DaemonConnected(0) not in bench.heard
+        is_over.set()
+        await settle()
+        assert life.DaemonConnected(0) in bench.heard
+        bench.dialogue.cancel()
+        child.close(asyncio.get_running_loop(), 5)
+        os.close(child.output)
+
+    live(work)
+
+
 def test_what_is_still_asked_is_given_up(tmp_path: Path) -> None:
     async def work() -> None:
         bench, before = Bench(tmp_path), asyncio.all_tasks()

@@ -26,13 +26,15 @@ from dora_systemd.runner.cell.restarts import (
     Life,
     age,
     asked,
+    begin_hold,
     begin_life,
     find_spent,
     forget_restarts,
-    hold_back,
+    held_until,
     is_first_life,
     is_transient,
     learn_first,
+    no_hold,
     pause,
     report_last_life,
     show,
@@ -112,7 +114,11 @@ class Unit:
         (self.paths.root / "restarts").write_text(f"{restarts}\n")
         self.slept = 0.0
         pause(self.options(policy), self.paths)
-        hold_back(self.options(policy), self.paths, self.old + self.slept)
+        if fd_store.lives():
+            old, is_user = self.old + self.slept, self.paths.is_of_user
+            until = held_until(self.options(policy), is_user, old)
+            left = until - time.clock_gettime(time.CLOCK_MONOTONIC)
+            self.slept += max(round(left, 9), 0)
         self.keep_store()
         return self.slept
 
@@ -321,6 +327,26 @@ def test_systemd_is_asked_when_the_last_life_has_ended(unit: Unit) -> None:
     unit.start(0)
     last = unit.asked.splitlines()[-1]
     assert last == "show --value --property=ActiveExitTimestampMonotonic dora-robot.service"
+
+
+def test_the_nodes_of_a_restart_are_held_back(unit: Unit) -> None:
+    assert begin_hold(unit.options(POLICY), False) is no_hold
+    assert begin_life(unit.options(POLICY), False).hold is no_hold
+    unit.start(0)
+    unit.monkeypatch.setenv("LISTEN_FDNAMES", fd_store.LIFE)
+    unit.end(0.45)
+    hold = begin_life(unit.options(POLICY), False).hold
+    unit.monkeypatch.delenv("LISTEN_FDNAMES")  # what comes after it forgets them
+    slept: list[float] = []
+
+    async def note(seconds: float) -> None:
+        slept.append(seconds)
+
+    unit.monkeypatch.setattr(asyncio, "sleep", note)
+    asyncio.run(hold())
+    asyncio.run(no_hold())
+    (seconds,) = slept
+    assert 0 <= seconds <= 0.05
 
 
 def test_a_process_that_is_as_old_as_the_delay_asks_nobody(unit: Unit) -> None:
