@@ -10,8 +10,9 @@ from tests.system.cells import Cell
 from tests.system.needs.scene import place_of
 
 
-@pytest.fixture
-def place(cell: Cell) -> Iterator[Path]:
-    place = place_of(cell)
+@pytest.fixture(params=["/run", "/dev"])
+def place(cell: Cell, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """In /dev nothing is polled, because the kernel reports all changes there."""
+    place = place_of(cell, request.param)
     yield place
     shutil.rmtree(place)

@@ -77,9 +77,9 @@ def _all_alive(cell: Cell) -> bool:
     return all(node.is_alive for node in cell.status.nodes.values())
 
 
-def place_of(cell: Cell) -> Path:
+def place_of(cell: Cell, parent: str = "/run") -> Path:
     """A new directory that every user may see, and that no sandbox hides."""
-    place = Path("/run", f"needs-{cell.name}")
+    place = Path(parent, f"needs-{cell.name}")
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(mode=0o755)
     return place
