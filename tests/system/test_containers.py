@@ -10,6 +10,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ import pytest
 
 from dora_systemd.adapters.cgroup.groups import group_path, is_populated
 from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.chromium import Browser
 from tests.system.gateways import Front
+from tests.system.pages import faults
 
 HEX = "d0c" * 21 + "e"
 SCOPE = f"docker-{HEX}.scope"
@@ -149,22 +152,52 @@ def test_podman_with_split_cgroups(hers: Callable[..., None]) -> None:
     assert not is_populated(group_path(one["cgroup"]))
 
 
-def test_docker(cell: Cell, flow: Path, project: Project) -> None:
-    """The client says nothing of its container: it is the one that began after the client."""
+@pytest.fixture
+def with_docker(cell: Cell, flow: Path, project: Project) -> None:
+    """A dataflow whose node is a client of docker."""
     project.write("run", "import time\ntime.sleep(1000)\n")
     (project.root / "docker").symlink_to(sys.executable)
     cell.start(flow, "--env", f"RUN={project.root}/docker run image")
     wait_for("the client", lambda: containers(cell.doractl("list", cell.name, "-o", "json").stdout))
-    assert "a container of docker that is not known" in cell.doractl("list", cell.name).stdout
+
+
+@contextmanager
+def container_of_docker(cell: Cell) -> Iterator[None]:
+    """A cgroup with a name as those of docker have."""
     scope = ("systemd-run", cell.scope.flag, f"--unit={SCOPE}", "--scope", "--slice=system.slice")
     with_pipe = [*scope, "sleep", "1000"]
     pid = os.spawnvp(os.P_NOWAIT, with_pipe[0], with_pipe)
     try:
+        yield
+    finally:
+        run("systemctl", cell.scope.flag, "stop", SCOPE)
+        os.waitpid(pid, 0)
+
+
+@pytest.mark.usefixtures("with_docker")
+def test_docker(cell: Cell) -> None:
+    """The client says nothing of its container: it is the one that began after the client."""
+    assert "a container of docker that is not known" in cell.doractl("list", cell.name).stdout
+    with container_of_docker(cell):
         words = f"Outside:  policy: docker container ({HEX[:12]}, "
         wait_for("it is seen", lambda: words in cell.doractl("list", cell.name).stdout)
         done = cell.doractl("stop", cell.name, "-o", "json").stdout
         (left,) = json.loads(done)["details"]["left"]
         assert (left["node"], left["id"]) == ("policy", HEX)
-    finally:
-        run("systemctl", cell.scope.flag, "stop", SCOPE)
-        os.waitpid(pid, 0)
+
+
+@pytest.mark.lab
+@pytest.mark.browser
+@pytest.mark.usefixtures("with_docker")
+def test_the_page_says_what_a_stop_leaves(cell: Cell, browser: Browser) -> None:
+    browser.wait_text("#detail dl", "a container of docker that is not known, of policy")
+    with container_of_docker(cell):
+        browser.wait_text("#detail dl", f"docker container ({HEX[:12]}")
+        assert faults(browser) == []
+        browser.click("#detail [data-action=stop]")
+        words = f"of policy runs on; afterwards run: docker stop {HEX[:12]}."
+        browser.wait_text("#consequence", words)
+        assert faults(browser) == []
+        browser.click("#confirmed")
+        browser.wait_text("#said", "of policy still runs, run: docker stop")
+    assert browser.failures() == []

@@ -1,7 +1,7 @@
 // What can be done with a dataflow or a node: buttons, the question before it, and how it went.
 
 import { el, say } from "./dom.js";
-import { isUp } from "./words.js";
+import { isUp, leftWords } from "./words.js";
 
 const SAID_MS = 8000;
 
@@ -32,6 +32,8 @@ const ACTIONS = {
     "stopping"],
   "restart node": ["Restart", "The other nodes keep running.", "restarting"],
 };
+
+const ENDING = ["stop", "restart"];
 
 const LIMITS = {
   memory_limit: ["Memory", "4G"], memory_high: ["Memory, slowed down beyond", "3G"],
@@ -118,7 +120,8 @@ export function askFirst(action, node, flow, facts, act, release = "") {
   const limits = limitsOf(node, facts);
   say(by("question"), isSet ? `Limits of ${node ? `node ${node} of ` : ""}${flow.name}`
     : `${title} ${node ? `node ${node} of ${flow.name}` : flow.name}${release && ` to ${release}`}?`);
-  say(by("consequence"), consequence);
+  const ended = (flow.nodes ?? []).filter((one) => !node || one.node === node);
+  say(by("consequence"), `${consequence}${ENDING.includes(action) ? leftWords(ended) : ""}`);
   say(by("confirmed"), isSet ? "Set" : title);
   by("confirmed").dataset.action = action;
   by("limits").replaceChildren(...(isSet ? Object.keys(LIMITS).map((k) => limitField(k, limits)) : []));

@@ -11,7 +11,7 @@ import { Releases } from "./past/releases.js";
 import { Timeline } from "./past/timeline.js";
 import { Waits } from "./waits.js";
 import { Why } from "./why.js";
-import { bytes, isUp, since, uptime } from "./words.js";
+import { bytes, containerWords, isUp, outside, since, uptime } from "./words.js";
 
 const LIMITS = {
   memory_limit: "memory", memory_high: "memory high", swap_limit: "swap", cpu_limit: "CPU",
@@ -31,6 +31,9 @@ function undoneWords(why) {
   const last = why?.timeline.findLast(({ event }) => event === "release-rolled-back");
   return last ? `${last.text}, ${since(last.at_us)}` : "";
 }
+
+/** The containers for which no limit of a node holds, and which no stop of the dataflow ends. */
+const outsideWords = (nodes) => outside(nodes).map(containerWords).join(", ");
 
 const sandboxWords = ({ sandbox, network }) =>
   (network === "host" ? sandbox : `${sandbox}, network ${network}`);
@@ -191,6 +194,7 @@ export class Detail {
     facts.show("Machines", flow.machines?.length ? ["head", ...flow.machines].join(", ") : "");
     facts.show("Restarts", flow.restarts == null ? "" : String(flow.restarts));
     facts.show("Peak memory", flow.memory_peak_bytes == null ? "" : bytes(flow.memory_peak_bytes));
+    facts.show("Outside", up ? outsideWords(flow.nodes) : "");
     const isKnown = known.sandbox != null;
     facts.show("Limits", isKnown ? limitWords(known) : "");
     facts.show("Hot reload", isKnown ? (known.hot_reload ? "on" : "off") : "");

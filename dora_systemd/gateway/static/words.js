@@ -103,6 +103,29 @@ export function byNeed(a, b) {
 const UP = ["Starting", "Waiting", "Running", "Degraded", "Stopping", "Restarting", "Frozen"];
 export const isUp = (dataflow) => UP.includes(dataflow.status);
 
+/** The containers that do not end with the nodes that have started them, each with its node. */
+export const outside = (nodes) => nodes.flatMap(({ node, containers }) =>
+  (containers ?? []).filter(({ inside }) => !inside).map((one) => ({ ...one, node })));
+
+const SHORT_ID = 12;
+
+/** "podman container arm (0123456789ab, 12 MiB) of policy". */
+export function containerWords({ program, id, name, memory_bytes: memory, node }) {
+  if (!id) return `a container of ${program} that is not known, of ${node}`;
+  const facts = [id.slice(0, SHORT_ID), memory ? bytes(memory) : ""].filter(Boolean).join(", ");
+  return `${program} container${name ? ` ${name}` : ""} (${facts}) of ${node}`;
+}
+
+/** What a stop of these nodes leaves, and the commands that stop that; "" for nothing. */
+export function leftWords(nodes) {
+  const left = outside(nodes);
+  if (!left.length) return "";
+  const commands = left.filter(({ id }) => id).map(({ program, id, name }) =>
+    `${program} stop ${name || id.slice(0, SHORT_ID)}`);
+  const after = commands.length ? `; afterwards run: ${commands.join("; ")}` : "";
+  return ` ${left.map(containerWords).join(", ")} ${left.length === 1 ? "runs" : "run"} on${after}.`;
+}
+
 const TIMES = { millis: "ms", secs: "s", micros: "µs", nanos: "ns" };
 
 /** A source of dora's own, such as dora/timer/millis/20, in short. */
