@@ -41,7 +41,7 @@ from dora_systemd.decisions.dora.protocol import (
 from dora_systemd.decisions.gateway.frames import Malformed, format_malformed, parse_request
 from dora_systemd.decisions.gateway.page_messages import parse_message, shown_values
 from dora_systemd.decisions.gateway.request import has_token, refuse_address
-from dora_systemd.decisions.gateway.timeline import MOST_MARKS, timeline_values
+from dora_systemd.decisions.gateway.timeline import MOST_MARKS, Now, Use, parse_use, timeline_values
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.logs.lines import (
     LineEncoder,
@@ -204,8 +204,10 @@ def _lives(data: bytes) -> list[Life]:
 
 
 def _timeline(data: bytes) -> None:
-    for is_up in (True, False):
-        found = timeline_values(_happenings(data), "u", is_up, "boot")
+    records = filter(None, map(loaded, data.splitlines()))
+    used = dict(filter(None, (parse_use(one) for one in records if isinstance(one, dict))))
+    for now in (Now("boot", 1, Use(1, 1)), Now("boot")):
+        found = timeline_values(_happenings(data), "u", now, used)
         assert json.dumps(shown_values(found, MOST_MARKS)).isprintable()
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -99,6 +100,42 @@ def test_what_happened_before_the_page_was_opened(
     browser.resize(*PHONE, is_phone=True)
     browser.wait_js("document.documentElement.scrollWidth === 320")
     look(browser, "timeline-phone")
+    assert browser.failures() == []
+
+
+BURNER = """
+import time
+from dora import Node
+node = Node()
+end = time.process_time() + 1.5
+while time.process_time() < end:
+    pass
+print("burned", flush=True)
+for event in node:
+    pass
+"""
+MEANS = "document.querySelector('.past .mean.cpu').getAttribute('d').split('M').length - 1"
+
+
+def test_what_lives_have_used_before_the_page_was_opened(
+    browser: Browser, cell: Cell, project: Project, front: Front
+) -> None:
+    """The life that has ended by systemd's record, the present one by its cgroup."""
+    project.write("lines.py", BURNER)
+    cell.start(project.write("dataflow.yml", FLOW))
+    wait_for("it has used CPU", lambda: "burned" in journalctl("-o", "cat", "-u", cell.unit))
+    cell.doractl("restart", cell.name)
+    sync_journal()
+    browser.open(f"http://127.0.0.1:{front.port}/?later#{cell.status.uuid}")
+    browser.wait_js(f"{MEANS} === 2")
+    first, second = marks(browser, ", from ")
+    for text in (first, second):
+        assert re.search(r"CPU [0-9.]+\xa0% on average", text), text
+    assert "Stopped, from" in first
+    browser.wait_text(".past .legend", "dotted line: the average of a life")
+    look(browser, "before")
+    browser.resize(*PHONE, is_phone=True)
+    browser.wait_js("document.documentElement.scrollWidth === 320")
     assert browser.failures() == []
 
 

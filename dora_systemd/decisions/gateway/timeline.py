@@ -3,8 +3,8 @@
 All of it is read back from journal records, which nodes can write: it is bounded.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from dora_systemd.decisions.logs.journal_events import (
     BUILD_FAILED,
@@ -15,7 +15,14 @@ from dora_systemd.decisions.logs.journal_events import (
     ROLLED_BACK,
     START_ASKED,
 )
-from dora_systemd.decisions.why.lives import Happening, Life, find_lives, parse_number
+from dora_systemd.decisions.logs.query import UNIT_RESOURCES
+from dora_systemd.decisions.why.lives import (
+    Happening,
+    Life,
+    find_lives,
+    parse_number,
+    plain_text,
+)
 from dora_systemd.decisions.why.postmortem import examine
 from dora_systemd.decisions.why.verdict import Facts
 
@@ -48,17 +55,43 @@ OUTSIDE = (START_ASKED, BUNDLE_WRITTEN, BUNDLE_REFUSED)
 _UNIT_ENDS = ("unit-succeeded", "unit-failed")
 
 
+class Use(NamedTuple):
+    """What a life has used, None where that is not known."""
+
+    cpu_us: int | None = None  # CPU time
+    memory: int | None = None  # bytes, the most
+
+
+class Now(NamedTuple):
+    """The present."""
+
+    boot: str
+    at_us: int = 0  # CLOCK_REALTIME
+    use: Use | None = None  # of the last life, None if that has ended
+
+
+def parse_use(record: Mapping[str, Any]) -> tuple[str, Use] | None:
+    """The invocation of a unit, and what systemd records of its use; None for other records."""
+    # A node can write any field, but its record is about an event of ours.
+    if record.get("MESSAGE_ID") != UNIT_RESOURCES or "DORA_EVENT" in record:
+        return None
+    ids = (plain_text(record.get(key)) for key in ("INVOCATION_ID", "USER_INVOCATION_ID"))
+    cpu = _number(plain_text(record.get("CPU_USAGE_NSEC")))
+    memory = _number(plain_text(record.get("MEMORY_PEAK")))
+    return next(filter(None, ids), ""), Use(None if cpu is None else cpu // 1000, memory)
+
+
 def timeline_values(
-    happenings: Sequence[Happening], uuid: str, is_up: bool, now_boot: str
+    happenings: Sequence[Happening], uuid: str, now: Now, used: Mapping[str, Use]
 ) -> dict[str, Any]:
     """The lives and the marks, oldest first, for JSON; texts are not yet made printable.
 
-    happenings: oldest first. is_up: whether the last life has not ended.
+    happenings: oldest first. used: what lives have used, by invocation.
     """
     lives = own_lives(happenings, uuid)[-MOST_LIVES:]
-    shown = [
-        _life(life, now_boot, is_up and place == len(lives) - 1) for place, life in enumerate(lives)
-    ]
+    shown = [_life(life, now, used.get(life.invocation, Use())) for life in lives]
+    if lives and now.use is not None:
+        shown[-1] = _open_life(lives[-1], now, now.use)
     begin = min((one["began_us"] for one in shown), default=0)
     marks = [_mark(one) for one in happenings if one.name in MARKS and _is_own(one, uuid, begin)]
     return {"lives": shown, "marks": marks[-MOST_MARKS:], "is_cut": len(marks) > MOST_MARKS}
@@ -81,29 +114,49 @@ def _names(life: Life, uuid: str) -> bool:
     return any(one.detail("dataflow") == uuid for one in life.happenings)
 
 
-def _life(life: Life, now_boot: str, is_open: bool) -> dict[str, Any]:
-    first, last = life.happenings[0], life.happenings[-1]
-    known = {"began_us": life.began_us or first.at_us, "status": "", "text": "", "ended_us": None}
-    ready = life.first("dataflow-started")
-    known["ready_us"] = ready.at_us if ready else None
-    if is_open:
-        return {**known, "cpu_peak_percent": None, "memory_peak_bytes": None}
-    verdict = examine([life], Facts(now_boot=now_boot))
-    end = life.last(*END_EVENTS, *_UNIT_ENDS) or last
+def _life(life: Life, now: Now, use: Use) -> dict[str, Any]:
+    """A life that has ended."""
+    verdict = examine([life], Facts(now_boot=now.boot))
+    end = life.last(*END_EVENTS, *_UNIT_ENDS) or life.happenings[-1]
+    memory = _peak(life, "held_peak")
     return {
-        **known,
+        **_values(life, use, end.at_us),
         "ended_us": end.at_us,
         "status": verdict.status,
         "text": verdict.summary[:_MOST_TEXT],
         "cpu_peak_percent": _peak(life, "cpu_peak"),
-        "memory_peak_bytes": _peak(life, "held_peak"),
+        "memory_peak_bytes": use.memory if memory is None else memory,
     }
+
+
+def _open_life(life: Life, now: Now, use: Use) -> dict[str, Any]:
+    return {
+        **_values(life, use, now.at_us),
+        "ended_us": None,
+        "status": "",
+        "text": "",
+        "cpu_peak_percent": None,
+        "memory_peak_bytes": use.memory,
+    }
+
+
+def _values(life: Life, use: Use, until_us: int) -> dict[str, Any]:
+    """What lives have that have ended, or not."""
+    began_us, ready = life.began_us or life.happenings[0].at_us, life.first("dataflow-started")
+    average = None
+    if use.cpu_us is not None and until_us > began_us:
+        average = round(100 * use.cpu_us / (until_us - began_us), 1)
+    ready_us = ready.at_us if ready else None
+    return {"began_us": began_us, "ready_us": ready_us, "cpu_average_percent": average}
 
 
 def _peak(life: Life, key: str) -> int | None:
     """The most that a life has used, None if that is not recorded."""
     end = life.last(*END_EVENTS)
-    text = end.detail(key) if end else ""
+    return _number(end.detail(key)) if end else None
+
+
+def _number(text: str) -> int | None:
     return parse_number(text) if len(text) <= _MOST_DIGITS else None
 
 

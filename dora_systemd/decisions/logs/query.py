@@ -42,6 +42,9 @@ UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", UNIT_FAILED)
 UNIT_RESTART = "5eb03494b6584870a536b337290809b3"
 """MESSAGE_ID of systemd's record when it restarts a unit automatically."""
 
+UNIT_RESOURCES = "ae8f7b866b0347b9af31fe1c80b127c0"
+"""MESSAGE_ID of systemd's record of what a unit has used, which follows its end if that is much."""
+
 ALL_LINES = "all"
 """The value of --lines for all lines, also with --follow."""
 _BOOT = re.compile(r"all|(?:[0-9a-f]{32})?(?:[+-]?[0-9]+)?")
@@ -188,7 +191,7 @@ def timeline_matches(
     """Matches for these life events, systemd's records of lives of the unit, and requests."""
     dataflow = f"DORA_DATAFLOW={uuid}"
     own = [*scope_matches(scope, name), dataflow, *(f"DORA_EVENT={one}" for one in events)]
-    ids = (UNIT_STARTING, UNIT_RESTART, *UNIT_ENDS)
+    ids = (UNIT_STARTING, UNIT_RESTART, UNIT_RESOURCES, *UNIT_ENDS)
     lives = [*_systemd_matches(scope, name), *(f"MESSAGE_ID={one}" for one in ids)]
     asked = [dataflow, *_asked_matches(scope, *requests)]
     return [*own, "+", *lives, "+", *asked]

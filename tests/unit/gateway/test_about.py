@@ -22,6 +22,7 @@ from dora_systemd.gateway.live.lines import find_lines
 from dora_systemd.gateway.live.past import SPAN, read_timeline
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.listing import store_of
+from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.library import fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
@@ -215,6 +216,21 @@ def test_the_timeline_of_one_that_has_ended(bench: Bench) -> None:
     )
     (life,) = read_timeline(bench.scope, GONE)["lives"]
     assert (life["ended_us"], life["status"]) == (now - 1, "Stopped")
+
+
+def test_what_a_dataflow_has_used_since_its_start(bench: Bench) -> None:
+    group = fake_cgroups(bench.patch, bench.root) / "x"
+    group.mkdir()
+    (group / "cpu.stat").write_text("usage_usec 5000000\n")
+    (group / "memory.peak").write_text("4096\n")
+    bench.manager.add(options(), ControlGroup="/x")
+    bench.journal(event("dataflow-starting", time.time_ns() // 1000 - 10_000_000))
+    (life,) = read_timeline(bench.scope, UUID)["lives"]
+    assert (life["ended_us"], life["memory_peak_bytes"]) == (None, 4096)
+    assert 40 < life["cpu_average_percent"] <= 50
+    bench.manager.add(options(), ControlGroup="")
+    (life,) = read_timeline(bench.scope, UUID)["lives"]
+    assert (life["cpu_average_percent"], life["memory_peak_bytes"]) == (None, None)
 
 
 def test_the_bundles_of_a_dataflow(bench: Bench) -> None:

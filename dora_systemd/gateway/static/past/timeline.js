@@ -1,5 +1,6 @@
 // What happened to a dataflow, on one axis: lives, restarts, failures, releases and bundles from the
-// journal; what it uses, as long as the page is open, and before that the most of each life.
+// journal; what it uses, as long as the page is open, and before that the most and the average of each
+// life.
 
 import { el, say, svg } from "../dom.js";
 import { SLOW_US } from "../history.js";
@@ -15,6 +16,11 @@ const LETTER = 6.4;
 const MOST_LISTED = 20;
 const MOST_NAMED = 3;
 const LEAST = { cpu: 10, memory: 1 << 20 };
+// Of each lane: its name, how a value is written, and the fields of a life with its most and average.
+const USE = {
+  cpu: ["CPU", percent, "cpu_peak_percent", "cpu_average_percent"],
+  memory: ["Memory", bytes, "memory_peak_bytes", ""],
+};
 const EVERY_US = 60e6;
 const PAUSE_US = 5e6;
 // Of the time between two requests the gateway is busy for at most so much.
@@ -91,9 +97,8 @@ export class Timeline {
       }
       top += LABEL + ROW;
     }
-    for (const [key, name, format, peak] of [["cpu", "CPU", percent, "cpu_peak_percent"],
-      ["memory", "Memory", bytes, "memory_peak_bytes"]]) {
-      this.#use(parts, { key, name, format, peak }, lives, top);
+    for (const key of Object.keys(USE)) {
+      this.#use(parts, key, lives, top);
       top += LABEL + CHART;
     }
     this.#ticks(parts, top);
@@ -109,7 +114,7 @@ export class Timeline {
     for (const one of lives) {
       const status = one.status || this.flow.status;
       const until = one.ended_us ? `until ${clock(one.ended_us)}` : "until now";
-      const text = `${titled(status)}, from ${clock(one.began_us)} ${until}${one.text && `: ${one.text}`}`;
+      const text = `${titled(status)}, from ${clock(one.began_us)} ${until}${one.text && `: ${one.text}`}${useWords(one)}`;
       const at = one.ended_us ?? one.began_us;
       parts.push(this.#button(`life ${one.began_us}`, text, tone(status), at,
         [{ at_us: at, text }], svg("rect", { class: "life", x: one.from, y: top + LABEL + 5,
@@ -144,18 +149,24 @@ export class Timeline {
       } }, svg("title", {}, label), ...shapes);
   }
 
-  #use(parts, { key, name, format, peak }, lives, top) {
+  /** What was used since the page was opened, and before that by each life. */
+  #use(parts, key, lives, top) {
+    const [name, format, ...fields] = USE[key];
     const own = this.points.map((one) => ({ at: one.at, value: one[key] }));
-    const peaks = lives.filter((one) => one[peak] != null);
     const shown = own.filter(({ at }) => at >= this.axis.begin).map(({ value }) => value);
-    const most = Math.max(LEAST[key], ...shown, ...peaks.map((one) => one[peak]));
+    const before = own.length ? this.axis.x(own[0].at) : this.axis.width;
+    const until = (one) => (one.ended_us ? one.to : Math.max(Math.min(one.to, before), one.from));
+    const past = fields.map((field) => lives.filter((one) => one[field] != null)
+      .map((one) => ({ from: one.from, to: until(one), value: one[field] })));
+    const most = Math.max(LEAST[key], ...shown, ...past.flat().map(({ value }) => value));
     const bottom = top + LABEL + CHART - 4;
     const y = (value) => bottom - (CHART - 6) * (value / most);
-    const known = shown.length || peaks.length ? `, up to ${format(most)}` : "";
+    const known = shown.length || past.flat().length ? `, up to ${format(most)}` : "";
+    const levels = (found) => found.map((one) => `M${one.from} ${y(one.value)}H${one.to}`).join("");
     parts.push(laneName(`${name}${known}`, top),
       svg("path", { class: `line ${key}`, d: pathOf(own, this.axis, y, 3 * SLOW_US) }),
-      svg("path", { class: `peak ${key}`, d: peaks.map((one) =>
-        `M${one.from} ${y(one[peak])}H${one.to}`).join("") }),
+      svg("path", { class: `peak ${key}`, d: levels(past[0]) }),
+      svg("path", { class: `mean ${key}`, d: levels(past[1]) }),
       svg("path", { class: "base", d: `M0 ${bottom}H${this.axis.width}` }));
   }
 
@@ -173,8 +184,9 @@ export class Timeline {
     const kinds = new Set(groups.flatMap(({ marks }) => marks.map(({ kind }) => kind)));
     const words = Object.keys(KINDS).filter((kind) => kinds.has(kind))
       .map((kind) => `${KINDS[kind][0]} ${KINDS[kind][1]}`);
-    const isBefore = this.data?.lives?.some((one) => one.cpu_peak_percent ?? one.memory_peak_bytes);
-    if (isBefore) words.push("dashed line: the most of a life that has ended");
+    const has = (...fields) => this.data?.lives?.some((one) => fields.some((field) => one[field] != null));
+    if (has("cpu_peak_percent", "memory_peak_bytes")) words.push("dashed line: the most of a life");
+    if (has("cpu_average_percent")) words.push("dotted line: the average of a life");
     say(this.legend, [...words, zoneWords()].join(" · "));
   }
 
@@ -228,6 +240,14 @@ function rangeFor({ lives, marks }) {
   const first = Math.min(now(), ...[...lives.map((one) => one.began_us), ...marks.map((one) => one.at_us)]);
   const [hours] = RANGES.find(([one]) => now() - one * HOUR < first) ?? [MOST_USUAL];
   return Math.min(hours, MOST_USUAL);
+}
+
+/** " (CPU 12 % on average, at most 40 %; memory at most 3 MiB)", as far as that is known. */
+function useWords({ cpu_average_percent: mean, cpu_peak_percent: peak, memory_peak_bytes: memory }) {
+  const cpu = [mean == null ? "" : `${percent(mean)} on average`, peak == null ? "" : `at most ${percent(peak)}`];
+  const parts = [cpu.some(Boolean) ? `CPU ${cpu.filter(Boolean).join(", ")}` : "",
+    memory == null ? "" : `memory at most ${bytes(memory)}`].filter(Boolean);
+  return parts.length ? ` (${parts.join("; ")})` : "";
 }
 
 /** The first texts of several marks. */
