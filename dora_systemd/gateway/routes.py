@@ -17,6 +17,7 @@ from dora_systemd.decisions.gateway.request import (
 from dora_systemd.decisions.views.prometheus import CONTENT_TYPE, format_metrics
 from dora_systemd.gateway.control.serve import serve_control
 from dora_systemd.gateway.live.page import talk
+from dora_systemd.names import is_uuid
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.top import read_snapshot
 
@@ -100,9 +101,29 @@ async def answer_bundle(request: Request) -> Answer:
     )
 
 
+PICTURES = "/pictures/"
+
+
+async def answer_pictures(request: Request) -> Answer:
+    """Answer with the last pictures of a dataflow: /pictures/UUID. Raises DoraSystemdError."""
+    # Imported late: only a dataflow on a page needs it, and its imports are memory.
+    from dora_systemd.gateway.live.pictures import pictures_body
+
+    uuid = request.path.removeprefix(PICTURES)
+    if not is_uuid(uuid):
+        return text_answer(404, "there is nothing here")
+    body = await asyncio.to_thread(pictures_body, request.scope, uuid)
+    return Answer(200, "application/octet-stream", body, HEADERS)
+
+
+BELOW: dict[str, Get] = {BUNDLES: answer_bundle, PICTURES: answer_pictures}
+"""The routes of all paths that begin so."""
+
+
 def find_route(path: str) -> Get | None:
     """The route of a path, None if there is nothing."""
-    return GET.get(path, answer_bundle if path.startswith(BUNDLES) else None)
+    below = (route for prefix, route in BELOW.items() if path.startswith(prefix))
+    return GET.get(path) or next(below, None)
 
 
 SOCKETS: dict[str, Talk] = {

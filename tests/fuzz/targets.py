@@ -56,6 +56,7 @@ from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.description import Facts, parse_facts, problems, summary
 from dora_systemd.decisions.needs.links import link_problem, parse_link
 from dora_systemd.decisions.properties.assignments import parse_property
+from dora_systemd.decisions.recorder.mcap_reader import McapReader
 from dora_systemd.decisions.recorder.reading import Reading
 from dora_systemd.decisions.recorder.ring import ALIGN
 from dora_systemd.decisions.recorder.writer import Writer
@@ -158,6 +159,13 @@ def _ring(data: bytes) -> None:
     size = sum(one.head.size for one in Reading(store, store.size, ALIGN).messages())
     assert size <= ALIGN
     Writer(store, PAGE)
+
+
+def _recording(data: bytes) -> None:
+    found = McapReader(lambda at, size: data[at : at + size], len(data), 1000)
+    for topic in found.topics("arrow"):
+        last = found.last(topic)
+        assert last is None or len(last.data) <= 1000
 
 
 def _encoded(fields: Any) -> None:
@@ -313,6 +321,7 @@ TARGETS = {
     "exit": Target(_of_text(parse_exit, parse_dora_error, parse_filter)),
     "parcel": Target(_parcel, REFUSED),
     "ring": Target(_ring, (ValueError,)),
+    "recording": Target(_recording, (ValueError,)),
     "link": Target(_link),
     "bundle": Target(_bundle, REFUSED),
     "manifest": Target(lambda data: parse_manifest(data, "x.tar"), REFUSED),

@@ -45,6 +45,16 @@ class Bundle:
         self._file.seek(begin)
         return self._file.read(size)
 
+    def size_of(self, name: str) -> int:
+        """Bytes of a part, 0 if the bundle has none of that name."""
+        return self._places.get(name, (0, 0))[1]
+
+    def read_at(self, name: str, at: int, size: int) -> bytes:
+        """Bytes of a part from a place on; less comes at its end."""
+        begin, whole = self._places.get(name, (0, 0))
+        self._file.seek(begin + min(at, whole))
+        return self._file.read(max(min(size, whole - at), 0))
+
     def check(self) -> None:
         """Compare all parts with the manifest. Raises DoraSystemdError (BAD_INPUT)."""
         known = {one.name: one for one in self.manifest.parts}

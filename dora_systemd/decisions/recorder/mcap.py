@@ -20,12 +20,13 @@ CHUNK_SIZE = 1024 * 1024
 """Bytes after which a chunk ends."""
 MOST_CHANNELS = 4096
 MAX_TIME = (1 << 63) - 1
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
+_HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, _CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 _STATISTICS, _METADATA, _METADATA_INDEX, _SUMMARY_OFFSET, _DATA_END = range(0x0B, 0x10)
-_RECORD = struct.Struct("<BQ")
-_HEAD = struct.Struct("<HIQQ")
+RECORD = struct.Struct("<BQ")
+"""What a record begins with: its type, and the bytes that follow."""
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+SPAN = struct.Struct("<QQ")
 _COUNTS = struct.Struct("<QHIIIIQQ")
-_SPAN = struct.Struct("<QQ")
 
 
 def _text(text: str) -> bytes:
@@ -48,7 +49,7 @@ def _numbers(form: str, numbers: Mapping[int, int]) -> bytes:
 
 def _record(opcode: int, *parts: bytes) -> bytes:
     content = b"".join(parts)
-    return _RECORD.pack(opcode, len(content)) + content
+    return RECORD.pack(opcode, len(content)) + content
 
 
 def _time(time_ns: int) -> int:
@@ -67,7 +68,7 @@ class Times(NamedTuple):
 
     def pack(self) -> bytes:
         """Both in a record; 0 without messages."""
-        return _SPAN.pack(*(self if self.first <= self.last else (0, 0)))
+        return SPAN.pack(*(self if self.first <= self.last else (0, 0)))
 
 
 class McapWriter:
@@ -101,7 +102,7 @@ class McapWriter:
         """Write texts about the whole file."""
         self._end_chunk()
         data = _record(_METADATA, _text(name), _texts(texts))
-        place = _SPAN.pack(self._put(data), len(data))
+        place = SPAN.pack(self._put(data), len(data))
         self._metadata_indexes.append(_record(_METADATA_INDEX, place, _text(name)))
 
     def channel(self, topic: str, encoding: str, schema: bytes = b"") -> int | None:
@@ -119,24 +120,24 @@ class McapWriter:
         if schema:
             data = struct.pack("<I", len(schema)), schema
             head = struct.pack("<H", identity)
-            self._schemas.append(_record(_SCHEMA, head, _text(topic), _text(encoding), *data))
+            self._schemas.append(_record(SCHEMA, head, _text(topic), _text(encoding), *data))
             self._add(self._schemas[-1])
         head = struct.pack("<HH", number, identity)
-        record = _record(_CHANNEL, head, _text(topic), _text(encoding), _texts({}))
+        record = _record(CHANNEL, head, _text(topic), _text(encoding), _texts({}))
         self._definitions.append(record)
         self._add(record)
 
     def message(self, channel: int, sequence: int, log: int, publish: int, data: bytes) -> None:
         """Write a message. log, publish: ns since 1970."""
         log, publish = _time(log), _time(publish)
-        self._index.setdefault(channel, []).append(_SPAN.pack(log, self._size))
+        self._index.setdefault(channel, []).append(SPAN.pack(log, self._size))
         self._counts[channel] = self._counts.get(channel, 0) + 1
         self._times, self._chunk_times = (
             self._times.with_time(log),
             self._chunk_times.with_time(log),
         )
-        head = _HEAD.pack(channel, sequence % (1 << 32), log, publish)
-        self._add(_RECORD.pack(_MESSAGE, len(head) + len(data)) + head, data)
+        head = MESSAGE_HEAD.pack(channel, sequence % (1 << 32), log, publish)
+        self._add(RECORD.pack(MESSAGE, len(head) + len(data)) + head, data)
         if self._size >= CHUNK_SIZE:
             self._end_chunk()
 
@@ -153,11 +154,11 @@ class McapWriter:
         length, places = self._offset - start, dict[int, int]()
         for channel, entries in self._index.items():
             index = struct.pack("<HI", channel, sum(map(len, entries)))
-            places[channel] = self._put(_record(_MESSAGE_INDEX, index, *entries))
+            places[channel] = self._put(_record(MESSAGE_INDEX, index, *entries))
         index_length = self._offset - start - length
-        place, indexes = _SPAN.pack(start, length), _numbers("<Q", places)
-        ends = struct.pack("<Q", index_length), _text(""), _SPAN.pack(len(records), len(records))
-        self._chunk_indexes.append(_record(_CHUNK_INDEX, span, place, indexes, *ends))
+        place, indexes = SPAN.pack(start, length), _numbers("<Q", places)
+        ends = struct.pack("<Q", index_length), _text(""), SPAN.pack(len(records), len(records))
+        self._chunk_indexes.append(_record(CHUNK_INDEX, span, place, indexes, *ends))
         self._chunk, self._size, self._index, self._chunk_times = [], 0, {}, Times()
 
     def finish(self) -> None:
@@ -169,20 +170,20 @@ class McapWriter:
             *(sum(self._counts.values()), len(self._schemas), len(self._channels), 0),
             *(len(self._metadata_indexes), len(self._chunk_indexes)),
         )
-        times = _SPAN.unpack(self._times.pack())
+        times = SPAN.unpack(self._times.pack())
         statistics = _record(
             _STATISTICS, _COUNTS.pack(*counts, *times), _numbers("<Q", self._counts)
         )
         groups = {
-            _SCHEMA: self._schemas,
-            _CHANNEL: self._definitions,
+            SCHEMA: self._schemas,
+            CHANNEL: self._definitions,
             _STATISTICS: [statistics],
-            _CHUNK_INDEX: self._chunk_indexes,
+            CHUNK_INDEX: self._chunk_indexes,
             _METADATA_INDEX: self._metadata_indexes,
         }
         offsets = [self._put_group(*group) for group in groups.items() if group[1]]
         offset = self._put(b"".join(offsets))
-        footer = _RECORD.pack(_FOOTER, _SPAN.size + 4) + _SPAN.pack(start, offset)
+        footer = RECORD.pack(FOOTER, SPAN.size + 4) + SPAN.pack(start, offset)
         self._put(footer + struct.pack("<I", zlib.crc32(footer, self._crc)))
         self._put(MAGIC)
 

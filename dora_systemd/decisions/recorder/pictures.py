@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 from dora_systemd.decisions.recorder.reading import Recorded
@@ -17,6 +18,11 @@ from dora_systemd.decisions.recorder.reading import Recorded
 MOST_EACH = 10
 """Pictures of each output: the last ones."""
 MOST_PIXELS = 64 * 1024 * 1024
+MOST_METADATA = 64 * 1024
+_MOST_SEGMENTS = 1000
+"""Of a JPEG, before its sizes."""
+_SIZES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
+"""The markers of a JPEG behind which its sizes are: SOF0 to SOF15."""
 _FILES = {"jpeg": "jpg", "jpg": "jpg", "png": "png"}
 _RAW = ("rgb8", "bgr8")
 _STARTS = {"jpg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
@@ -36,41 +42,48 @@ def find_pictures(messages: Iterable[Recorded], outputs: Sequence[str]) -> Itera
     """The last pictures of each output."""
     last: dict[int, deque[Recorded]] = {}
     for one in messages:
-        if _encoding(one):
+        if is_picture(one.meta):
             last.setdefault(one.output, deque(maxlen=MOST_EACH)).append(one)
     for output, found in last.items():
         for one in found:
-            if picture := _picture(one):
+            if picture := picture_of(one):
                 ending, data = picture
                 folder = "".join(c if c.isalnum() or c in "_." else "-" for c in outputs[output])
                 yield Picture(f"{folder}/{one.head.number:06}.{ending}", data)
 
 
-def _metadata(message: Recorded) -> dict[str, object]:
+def is_picture(metadata: bytes) -> bool:
+    """Whether dora's metadata of a message are those of a picture."""
+    return bool(_encoding(metadata))
+
+
+def _metadata(text: bytes) -> dict[str, object]:
+    if len(text) > MOST_METADATA:
+        return {}
     try:
-        found = json.loads(message.meta)
+        found = json.loads(text)
     except (ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 
 
-def _encoding(message: Recorded) -> str:
-    if b"encoding" not in message.meta:
+def _encoding(metadata: bytes) -> str:
+    if b"encoding" not in metadata:
         return ""
-    encoding = str(_metadata(message).get("encoding")).lower()
+    encoding = str(_metadata(metadata).get("encoding")).lower()
     return encoding if encoding in _FILES or encoding in _RAW else ""
 
 
-def _picture(message: Recorded) -> tuple[str, bytes] | None:
-    """The ending of the file, and its bytes."""
-    encoding = _encoding(message)
+def picture_of(message: Recorded) -> tuple[str, bytes] | None:
+    """The ending of the file, and its bytes; None if the message is no picture."""
+    encoding = _encoding(message.meta)
     try:
         data = array_bytes(message.schema, message.data)
     except (ValueError, struct.error):
         return None
     if ending := _FILES.get(encoding):
         return (ending, data) if data.startswith(_STARTS[ending]) else None
-    metadata = _metadata(message)
+    metadata = _metadata(message.meta)
     width, height = metadata.get("width"), metadata.get("height")
     if type(width) is not int or type(height) is not int:
         return None
@@ -81,6 +94,30 @@ def _picture(message: Recorded) -> tuple[str, bytes] | None:
         pixels[0::3], pixels[2::3] = data[2::3], data[0::3]
         data = bytes(pixels)
     return "png", format_png(width, height, data)
+
+
+def pixels_of(ending: str, data: bytes) -> int:
+    """The pixels that a viewer makes of a file, by the sizes in it; 0 for no picture.
+
+    A small file can have so many that a browser uses all memory.
+    """
+    with suppress(ValueError, struct.error):
+        width, height = struct.unpack_from(">II", data, 16) if ending == "png" else _sizes(data)
+        return int(width) * int(height)
+    return 0
+
+
+def _sizes(jpeg: bytes) -> tuple[int, int]:
+    at = 2
+    for _ in range(_MOST_SEGMENTS):
+        mark, kind, size = struct.unpack_from(">BBH", jpeg, at)
+        if mark != 0xFF or size < 2:
+            break
+        if kind in _SIZES:
+            height, width = struct.unpack_from(">HH", jpeg, at + 5)
+            return width, height
+        at += 2 + size
+    raise ValueError("it has no sizes")
 
 
 def format_png(width: int, height: int, rgb: bytes) -> bytes:

@@ -8,6 +8,7 @@ and numbers; only pictures.py interprets Arrow.
 import heapq
 from collections import deque
 from collections.abc import Iterator
+from itertools import islice
 from typing import NamedTuple, Protocol
 
 from dora_systemd.decisions.recorder.ring import (
@@ -101,14 +102,23 @@ class Reading:
                 self.damaged += 1
         for output in range(len(self._states)):
             # Those of an output that has few can have been replaced meanwhile, or are the oldest.
-            if output not in seen and (message := self._newest(output)):
+            if output not in seen and (message := self.newest(output)):
                 yield message
 
-    def _newest(self, at: int) -> Recorded | None:
+    def metadata(self, at: int) -> bytes:
+        """The metadata of the oldest message of one output, b"" for none, or too many bytes."""
+        for _, head, position, _ in islice(self._walk(at, self._state(at)[0]), 1):
+            start = position + RECORD_SIZE + head.schema_size
+            if head.meta_size <= self._most:
+                return read_tape(self._source, self.header, at, start, head.meta_size)
+        return b""
+
+    def newest(self, at: int, most: int = MOST_RECORDS) -> Recorded | None:
+        """The last message of one output; None for none, and if it has more than `most`."""
         for _ in range(_TRIES):
-            last = deque(self._walk(at, self._state(at)[0]), maxlen=1)
-            for output, head, position, crc in last:
-                if head.size > self._most:
+            last = deque(enumerate(islice(self._walk(at, self._state(at)[0]), most + 1)), maxlen=1)
+            for count, (output, head, position, crc) in last:
+                if head.size > self._most or count == most:
                     return None
                 if message := self._message(output, head, position, crc):
                     return message

@@ -7,6 +7,7 @@ import { Logs } from "./logs.js";
 import { NodeRow } from "./nodes.js";
 import { Facts, cpuChart, memoryChart, showState, showUse } from "./parts.js";
 import { Bundles } from "./past/bundles.js";
+import { Pictures } from "./past/pictures.js";
 import { Releases } from "./past/releases.js";
 import { Timeline } from "./past/timeline.js";
 import { Waits } from "./waits.js";
@@ -64,6 +65,7 @@ export class Detail {
       this.send({ type: "bundles" });
     };
     this.timeline = new Timeline(askPast, (at) => this.#showLog(at));
+    this.pictures = new Pictures(uuid);
     this.bundles = new Bundles(this.buttons.all.bundle);
     this.logs = new Logs((node) => this.follow(node), this.send);
     const panel = (title, label, node) => el("section", { class: "panel", "aria-label": label },
@@ -77,7 +79,7 @@ export class Detail {
         this.buttons.node),
       this.why.node, this.facts.node,
       el("div", { class: "charts" }, this.charts.cpu.node, this.charts.memory.node),
-      this.waits.node, this.timeline.node, ...this.panels, this.releases.node,
+      this.waits.node, this.timeline.node, this.pictures.node, ...this.panels, this.releases.node,
       this.bundles.node, this.logs.node);
   }
 
@@ -85,7 +87,7 @@ export class Detail {
   begin() {
     this.send({ type: "graph" });
     this.asks = 2;
-    this.releases.isDue = this.timeline.isDue = true;
+    this.releases.isDue = this.timeline.isDue = this.pictures.isDue = true;
     this.logs.begin(this.chosen);
   }
 
@@ -121,7 +123,7 @@ export class Detail {
 
   askAbout() {
     this.send({ type: "about" });
-    this.releases.isDue = this.timeline.isDue = true;
+    this.releases.isDue = this.timeline.isDue = this.pictures.isDue = true;
   }
 
   show(flow, history, isFree) {
@@ -143,6 +145,7 @@ export class Detail {
     this.buttons.show(flow, this.about, isFree);
     this.releases.show(flow, isFree);
     this.bundles.show(flow);
+    this.pictures.show(flow);
   }
 
   /** Another state has another reason, and another run may have other nodes and wires. */

@@ -37,7 +37,8 @@ def test_a_bundle_is_sent_in_parts(tmp_path: Path) -> None:
         gateway = Gateway(ScopeIn(True, os.getuid(), tmp_path), "token")
         running = asyncio.ensure_future(gateway.run([listener], 60))
         found = []
-        for path in (f"/bundles/robot/{BUNDLE}", "/bundles/robot/x.tar", "/bundles/"):
+        paths = "/bundles/robot/x.tar", "/bundles/", "/pictures/", "/pictures/x/y"
+        for path in (f"/bundles/robot/{BUNDLE}", *paths):
             reader, writer = await asyncio.open_connection(*listener.getsockname())
             writer.write(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
             found.append(await reader.read())

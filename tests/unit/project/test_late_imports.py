@@ -16,7 +16,7 @@ LATE = {
             *("decisions.views.releases", "verbs.releases.listing"),
             *("decisions.bundles.table", "verbs.bundles.listing"),
         },
-        "gateway.routes": {"verbs.bundles.listing"},
+        "gateway.routes": {"verbs.bundles.listing", "gateway.live.pictures"},
         "gateway.live.actions": {
             *("verbs.releases.listing", "verbs.releases.rollback", "verbs.bundles.write"),
         },

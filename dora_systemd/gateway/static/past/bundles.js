@@ -3,7 +3,8 @@
 import { arrange, el, say } from "../dom.js";
 import { bytes, since } from "../words.js";
 
-const address = ({ name, bundle }) =>
+/** Where a bundle is downloaded. */
+export const address = ({ name, bundle }) =>
   `/bundles/${encodeURIComponent(name)}/${encodeURIComponent(bundle)}`;
 
 class BundleRow {

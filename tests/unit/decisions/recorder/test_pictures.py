@@ -16,6 +16,7 @@ from dora_systemd.decisions.recorder.pictures import (
     array_bytes,
     find_pictures,
     format_png,
+    pixels_of,
 )
 from dora_systemd.decisions.recorder.reading import Recorded
 from dora_systemd.decisions.recorder.ring import RecordHead
@@ -130,8 +131,35 @@ def test_what_is_no_picture(metadata: dict[str, object]) -> None:
 
 def test_metadata_that_are_none() -> None:
     one = recorded({})
+    long = json.dumps({"encoding": "rgb8", "width": 4, "height": 2, "x": "y" * 70_000}).encode()
+    assert pictures(one._replace(meta=long)) == []
     for meta in (b"encoding", b'["encoding"]', b'"encoding' + b"[" * 50_000, b"[" * 50_000):
         assert pictures(one._replace(meta=meta + b"encoding")) == []
+
+
+JPEG = "ffd8 ffe00004abcd ffc0000b080300050001"
+
+
+@pytest.mark.parametrize(
+    ("jpeg", "pixels"),
+    [
+        (JPEG, 0x0300 * 0x0500),
+        (JPEG.replace("ffc0", "ffc2"), 0x0300 * 0x0500),
+        (JPEG.replace("ffc0", "ffc4"), 0),
+        (JPEG.replace("ffe00004", "ffe00001"), 0),
+        (JPEG.replace("ffe0", "00e0"), 0),
+        ("ffd8" + 2000 * "ffe00002" + "ffc0000b080300050001", 0),
+        (JPEG[:-6], 0),
+        ("", 0),
+    ],
+)
+def test_the_pixels_that_a_jpeg_says_it_has(jpeg: str, pixels: int) -> None:
+    assert pixels_of("jpg", bytes.fromhex(jpeg)) == pixels
+
+
+def test_the_pixels_that_a_png_says_it_has() -> None:
+    assert pixels_of("png", format_png(4, 2, BODY)) == 8
+    assert pixels_of("png", b"\x89PNG\r\n\x1a\n") == 0
 
 
 def test_the_last_ones_of_each_output() -> None:

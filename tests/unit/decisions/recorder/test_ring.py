@@ -273,3 +273,18 @@ def test_the_header_is_read_back_and_others_are_refused() -> None:
     assert len(json.dumps(["a/b"])) < ALIGN
     with pytest.raises(ValueError, match="does not fit"):
         Reading(ring()[0], 5, BIG)
+
+
+def test_the_last_message_of_one_output() -> None:
+    store, _ = ring()
+    one = writer(store)
+    for at in range(3):
+        one.put(0, message(b"x", at))
+    reading = Reading(store, store.size, 1 << 20)
+    last = reading.newest(0, 3)
+    assert last is not None
+    assert (last.head.number, last.data) == (3, b"x")
+    assert reading.newest(0, 2) is None, "it has more messages than are searched"
+    assert reading.newest(1) is None
+    assert (reading.metadata(0), reading.metadata(1)) == (b"{}", b"")
+    assert Reading(store, store.size, 1).metadata(0) == b""
