@@ -128,6 +128,11 @@ def notice_unit(name: str, suffix: str = UNIT_SUFFIX) -> str:
     return f"{NOTICE_PREFIX}@{name}{suffix}"
 
 
+def notice_hold_unit(name: str) -> str:
+    """The unit that keeps that of a failed dataflow loaded until notice_unit() has its setting."""
+    return f"{NOTICE_PREFIX}-hold@{name}{UNIT_SUFFIX}"
+
+
 def notice_command_unit(name: str) -> str:
     """The unit in which the command of a notice runs."""
     return f"{NOTICE_PREFIX}-{name}{UNIT_SUFFIX}"

@@ -24,6 +24,7 @@ class RingFile:
 
     def __init__(self, fd: int, header: Header) -> None:
         self._fd = fd
+        self._is_open = True
         self.header = header
         self.size = os.fstat(fd).st_size
 
@@ -37,8 +38,10 @@ class RingFile:
         return os.fstat(self._fd).st_blocks * 512
 
     def close(self) -> None:
-        """Close the file."""
-        os.close(self._fd)
+        """Close the file, once."""
+        if self._is_open:
+            self._is_open = False
+            os.close(self._fd)
 
 
 def find_ring(pids: Iterable[int], uuid: str, uid: int, proc: Path = _PROC) -> RingFile | None:

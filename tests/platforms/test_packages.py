@@ -121,7 +121,7 @@ def test_doctor_says_what_it_lacks(user: str) -> None:
 def test_its_units_are_understood() -> None:
     units = [str(path) for path in Path("/usr/lib/systemd/system").glob("dora*.*")]
     units = [unit for unit in units if not unit.endswith(".d")]
-    assert len(units) == 6
+    assert len(units) == 7
     assert run("systemd-analyze", "verify", "--man=no", *units).stderr == ""
     assert "dora.target" in run("systemctl", "list-dependencies", "multi-user.target").stdout
     assert pwd.getpwnam("dora").pw_shell == "/usr/sbin/nologin"

@@ -3,8 +3,10 @@
 import json
 import os
 import pwd
+import shutil
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from dora_systemd.errors import ExitCode
 from dora_systemd.names import notice_command_unit, notice_unit
 from tests.system.cells import Cell, Project, journalctl, run, wait_for
 from tests.system.releases import Releases, write_version
+from tests.system.test_bundle import STORE
 
 # The units of notices are installed below /usr/local.
 pytestmark = [pytest.mark.lab, pytest.mark.usefixtures("units_for_all")]
@@ -130,6 +133,47 @@ def test_a_killed_runner(cell: Cell, project: Project) -> None:
     os.kill(int(cell.show("MainPID")), signal.SIGKILL)
     (text,) = wait_for("the notice", lambda: notices(project))
     assert lines(text)["CAUSE"] == "the supervisor process was killed (SIGKILL)"
+
+
+@pytest.fixture
+def late(project: Project) -> Iterator[Path]:
+    """The service that sends notices waits for this file before it reads anything."""
+    go = project.root / "go"
+    place = Path("/run/systemd/system/doranotice@.service.d/waits.conf")
+    place.parent.mkdir()
+    wait = f"until [ -e {go} ]; do sleep 0.05; done"
+    place.write_text(f"[Service]\nExecStartPre=/bin/sh -c '{wait}'\n")
+    run("systemctl", "daemon-reload")
+    yield go
+    shutil.rmtree(place.parent)
+    run("systemctl", "daemon-reload")
+
+
+@pytest.mark.warns(*FAILS, "killed", "SIGKILL")
+@pytest.mark.parametrize("by", ["doractl", "systemctl"])
+def test_a_dataflow_that_is_stopped_before_its_notice(
+    cell: Cell, project: Project, late: Path, by: str
+) -> None:
+    """What the notice needs is that of the failure, however late the service is that reads it."""
+    policy = ["--restart-policy=on-failure", "--restart-delay=60s", "--max-restart-delay=60s"]
+    cell.start(flow(project), *policy, *options(project), "--black-box=yes")
+    user = cell.show("User")
+    os.kill(int(cell.show("MainPID")), signal.SIGKILL)
+    state = ("systemctl", "is-active", notice_unit(cell.name))
+    wait_for("the service", lambda: "activating" in run(*state, check=False).stdout)
+    wait_for("its end", lambda: cell.show("SubState") == "auto-restart")
+    run(by, "stop", cell.name if by == "doractl" else cell.unit)
+    assert (cell.show("ActiveState"), cell.show("LoadState")) == ("inactive", "loaded")
+    assert notices(project) == []
+    late.touch()
+    (text,) = wait_for("the notice", lambda: notices(project))
+    found = lines(text)
+    assert (found["EVENT"], found["user"]) == ("failed", user)
+    assert recorded(cell, "bundle-written")
+    wait_for("systemd unloads it", lambda: cell.show("LoadState") == "not-found")
+    ends(cell)
+    assert recorded(cell, "notice-failed") == []
+    shutil.rmtree(STORE / cell.name)
 
 
 @pytest.mark.warns(*FAILS)

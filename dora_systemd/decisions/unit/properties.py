@@ -41,7 +41,7 @@ from dora_systemd.decisions.settings.sandbox import credential_properties
 from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import SLICE, notice_unit, release_of, unit_description
+from dora_systemd.names import SLICE, notice_hold_unit, notice_unit, release_of, unit_description
 from dora_systemd.scope import NOTICE_NAME, RUNTIME_NAME
 from dora_systemd.values import INFINITY, SECOND, quoted
 
@@ -232,7 +232,8 @@ def notice_properties(options: RunnerOptions) -> dict[str, Property]:
     if not options.is_noticed:
         return {}
     return typed(
-        OnFailure=(notice_unit(options.name),),
+        # Apart: a reference of the service would keep the dataflow loaded as long as that runs.
+        OnFailure=(notice_unit(options.name), notice_hold_unit(options.name)),
         Wants=(notice_unit(options.name, ".path"),),
         RuntimeDirectory=(f"{NOTICE_NAME}/{options.name}",),
     )

@@ -27,7 +27,7 @@ class SetupFile(NamedTuple):
 
 _UNITS = (
     *("dora.slice", "dora.target", "dora-gateway.socket", "dora-gateway.service"),
-    *("doranotice@.path", "doranotice@.service"),
+    *("doranotice@.path", "doranotice@.service", "doranotice-hold@.service"),
 )
 SANDBOX = SetupFile(
     ("templates", "dora-gateway-sandbox.conf"), "dora-gateway.service.d/10-sandbox.conf"

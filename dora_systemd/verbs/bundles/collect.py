@@ -35,6 +35,7 @@ from dora_systemd.decisions.why.lives import plain_text
 from dora_systemd.decisions.why.report import Report, report_object
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_table
+from dora_systemd.trust.rings import RingFile
 from dora_systemd.verbs.bundles import recording
 from dora_systemd.verbs.facts.cells import Cell
 
@@ -59,6 +60,7 @@ class Evidence:
     examine: Callable[[], Iterable[Finding]]  # doctor's
     want_pictures: bool = False
     has_lost_power: bool = False  # the life that it is about has ended with the power
+    ring: RingFile | None = None  # the ring, if it was opened when the failure was seen
     # what is not in the bundle, and why; a section may add to it while it is written
     left_out: list[str] = field(default_factory=list)
 
@@ -77,6 +79,8 @@ def sections_of(what: Evidence) -> list[Section]:
         what.left_out.append("journal.export.gz and lines of nodes: --no-journal")
     if what.cell is not None:
         found.append(Section("unit.txt", lambda sink: _put_lines(sink, _unit(what))))
+    else:
+        what.left_out.append("unit.txt: systemd has unloaded the dataflow")
     if what.is_up:
         found.append(Section("cgroup.json", lambda sink: _put_json(sink, _groups(what))))
         found.append(Section("nodes.json", lambda sink: _put_json(sink, _nodes(what))))
@@ -97,7 +101,8 @@ def _recording(what: Evidence) -> list[Section]:
     if what.has_lost_power:
         what.left_out.append(f"{recording.RECORDING}: power was lost")
         return []
-    ring = recording.find(what.manager, what.scope, what.cell, what.report.subject.uuid)
+    uuid = what.report.subject.uuid
+    ring = what.ring or recording.find(what.manager, what.scope, what.cell, uuid)
     return recording.sections(ring, what.left_out, what.want_pictures)
 
 

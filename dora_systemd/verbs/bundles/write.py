@@ -43,6 +43,7 @@ from dora_systemd.decisions.notice.happened import POWER_LOST
 from dora_systemd.decisions.why.report import format_report
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.trust.rings import RingFile
 from dora_systemd.values import shown
 from dora_systemd.verbs.bundles.collect import Evidence, sections_of
 from dora_systemd.verbs.doctor import examine
@@ -117,6 +118,7 @@ def _evidence(
     want_journal: bool,
     want_pictures: bool = False,
     has_lost_power: bool = False,
+    ring: RingFile | None = None,
 ) -> Evidence:
     """Find the dataflow, and what is known of it. Raises DoraSystemdError."""
     manager = reach(scope)
@@ -125,15 +127,16 @@ def _evidence(
     cell = read_cell(manager, subject.unit) if subject.is_loaded else None
     row = subject_row(manager, scope, subject)
     found = partial(examine, reach, scope)
-    more = want_pictures, has_lost_power
+    more = want_pictures, has_lost_power, ring
     return Evidence(manager, scope, report, row, cell, want_journal, found, *more)
 
 
 class Failure(NamedTuple):
-    """What a bundle is about that nobody has requested, for its event."""
+    """What a bundle is about that nobody has requested."""
 
     event: str  # one of ORDER of decisions/notice/happened.py, or POWER_LOST
-    details: dict[str, str]
+    details: dict[str, str]  # of the event of the bundle
+    ring: RingFile | None = None  # of the recorder, opened before the dataflow could be unloaded
 
 
 def write_after(
@@ -173,12 +176,17 @@ def _written_after(
 ) -> str:
     """Write the bundle; return its path. Raises DoraSystemdError."""
     is_cut = failure.event == POWER_LOST
-    what = _evidence(reach, scope, cell.uuid, want_journal=True, has_lost_power=is_cut)
+    what = _evidence(
+        reach, scope, cell.uuid, want_journal=True, has_lost_power=is_cut, ring=failure.ring
+    )
     manifest = replace(_manifest(what, BY), event=failure.event)
     store = BundleStore(scope.state_root, cell.name)
     with locked(store), _explained(store.path):
         store.remove_partial()
         past = [_past(one) for one in store.known() if one.event != REQUESTED]
+        if what.cell is None:
+            # It was stopped after the failure: the report has the stop as the cause.
+            past = [one._replace(node=manifest.node, cause=manifest.cause) for one in past]
         if is_too_soon(past, manifest.node, manifest.cause, now_us):
             about = f"node {manifest.node}" if manifest.node else "the same cause"
             message = f"one about {about} was written less than 10 minutes ago"

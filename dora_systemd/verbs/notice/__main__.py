@@ -25,11 +25,12 @@ def main(arguments: Sequence[str]) -> int:
         name = parse_name(arguments[0] if arguments else "")
         scope = Scope(is_user=is_directory_of_user(place), uid=os.getuid())
         manager, journal = Bus(scope), JournalReader()
-        notify.send_ready()
         sender = Sender(manager, scope, name, journal, Path(place))
+        sender.learn()
+        notify.send_ready()  # from now on systemd may unload the dataflow
         sender.write_after_boot(time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000)
         read = partial(read_journal, journal, scope, name)
-        Dispatcher(manager, scope, name, read, sender.send).run()
+        Dispatcher(manager, scope, name, read, sender.learn, sender.send).run()
     except DoraSystemdError as error:
         print(f"<4>{error.message}; {error.hint}", file=sys.stderr)
         return error.code

@@ -48,7 +48,8 @@ def read_journal(journal: JournalReader, scope: Scope, name: str) -> Story:
 class Dispatcher:
     """Sends notices of one dataflow until there is nothing to report.
 
-    read: what has happened; it raises DoraSystemdError if the journal cannot be read.
+    read: what has happened; it raises DoraSystemdError if the journal cannot be read. learn: reads
+    the dataflow, before each pause, in which it may be stopped.
     """
 
     def __init__(
@@ -57,12 +58,13 @@ class Dispatcher:
         scope: Scope,
         name: str,
         read: Callable[[], Story],
+        learn: Callable[[], None],
         send: Send,
         sleep: Callable[[float], None] = time.sleep,
         now_us: Callable[[], int] = monotonic_us,
     ) -> None:
         self._manager, self._scope, self._name = manager, scope, name
-        self._read, self._send = read, send
+        self._read, self._learn, self._send = read, learn, send
         self._sleep, self._now_us = sleep, now_us
 
     def run(self) -> None:
@@ -87,6 +89,7 @@ class Dispatcher:
 
     def _work(self) -> bool:
         """Send one notice, or wait until it may be sent; whether there was anything to report."""
+        self._learn()
         self._clear_requests()
         try:
             happened, last = self._read()

@@ -4,6 +4,7 @@ import json
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager
@@ -29,7 +30,6 @@ from dora_systemd.decisions.notice.unit import (
     JSON,
     SECONDS,
     NoticeUnit,
-    names_to_copy,
     notice_properties,
 )
 from dora_systemd.decisions.unit.systemd_versions import transient_commands
@@ -37,8 +37,9 @@ from dora_systemd.decisions.why.report import format_report, report_object
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import notice_command_unit, unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.lives import now_boot
+from dora_systemd.verbs.notice.noticed import Memory, Noticed
 from dora_systemd.verbs.start.unit import systemd_number
 from dora_systemd.verbs.why import explain, subject_row
 
@@ -60,23 +61,34 @@ class Sender:
     ) -> None:
         self._manager, self._scope, self._name = manager, scope, name
         self._journal, self._place = journal, place
+        self._memory = Memory(manager, scope, name)
+
+    def learn(self) -> None:
+        """Read the setting, and all else of the dataflow that is gone when it is stopped."""
+        self._memory.learn()
 
     def send(self, happened: Sequence[Happened], pause_us: int) -> None:
         """Run the command of the setting, and record the notice, whatever came of it."""
-        cell = read_cell(self._manager, unit_name(self._name))
-        box = cell.options.of_dataflow("black_box") if cell else None
-        if cell and box:
-            self._write_bundle(cell, box, happened, pause_us)
-        if cell and box and not cell.options.has("on_failure"):
+        if (noticed := self._memory.noticed) is None:
+            return self._record("", happened, pause_us, self._unnoticed())
+        if noticed.box:
+            self._write_bundle(noticed.cell, noticed.box, happened, pause_us)
+            self._memory.close_ring()
+        if not noticed.has_command:
             return None
-        if cell is None or not cell.options.has("on_failure"):
-            return self._record("", happened, pause_us, "the dataflow has no on_failure any more")
-        node = self._write_report(cell, happened)
+        node = self._write_report(noticed.cell, happened)
         try:
-            problem = self._run(cell, happened, node)
+            problem = self._run(noticed, happened, node)
         except DoraSystemdError as error:
             problem = error.message
-        return self._record(cell.uuid, happened, pause_us, problem, node)
+        return self._record(noticed.cell.uuid, happened, pause_us, problem, node)
+
+    def _unnoticed(self) -> str:
+        """Why there is no setting."""
+        with suppress(DoraSystemdError):
+            if self._memory.is_loaded:
+                return "the dataflow has no on_failure any more"
+        return f"systemd had unloaded {unit_name(self._name)} before its setting was read"
 
     def _write_bundle(
         self, cell: Cell, box: BlackBox, happened: Sequence[Happened], pause_us: int
@@ -86,13 +98,13 @@ class Sender:
         from dora_systemd.verbs.bundles.write import Failure, write_after
 
         details = {"until": str(happened[0].mono_us), "pause": str(pause_us)}
-        failure = Failure(main_one(happened).what, details)
+        failure = Failure(main_one(happened).what, details, self._memory.ring_of(cell.uuid))
         write_after(self._reach, self._scope, cell, box, failure)
 
     def write_after_boot(self, now_us: int) -> None:
         """Write a bundle of the life that a power cut has ended. now_us: CLOCK_BOOTTIME."""
-        cell = read_cell(self._manager, unit_name(self._name))
-        box = cell.options.of_dataflow("black_box") if cell else None
+        noticed = self._memory.noticed
+        cell, box = (noticed.cell, noticed.box) if noticed else (None, None)
         if cell is None or box is None or not is_after_boot(box, now_us):
             return
         records = self._journal.newest(cut_matches(self._scope, self._name), MOST_ENDS)
@@ -118,8 +130,9 @@ class Sender:
         write_atomic(self._place / JSON, json.dumps(found), 0o600)
         return node
 
-    def _run(self, cell: Cell, happened: Sequence[Happened], node: str) -> str:
+    def _run(self, noticed: Noticed, happened: Sequence[Happened], node: str) -> str:
         """Run the command, or start the unit; return what went wrong, or ""."""
+        cell, copied = noticed.cell, noticed.copied
         own, host = notice_command_unit(self._name), os.uname().nodename
         unit = unit_of(words_of(cell.options), self._name)
         is_here = self._scope.is_user or unit
@@ -128,17 +141,14 @@ class Sender:
         if unit:
             write_atomic(self._place / _ENVIRONMENT, format_environment(values), 0o600)
             return self._start(unit)
-        types = self._manager.property_types()
-        copied = self._manager.read(cell.unit, names_to_copy(types))
         if not self._scope.is_user and not copied.get("User"):
             return f"{cell.unit} has no User="
-        of_nodes = self._manager.read(cell.unit, ["Environment"])["Environment"]
         wanted = NoticeUnit(
             name=self._name,
             uuid=cell.uuid,
             words=words_of(cell.options),
             directory=cell.options.working_directory,
-            environment=(*of_nodes, *(f"{key}={text}" for key, text in values.items())),
+            environment=(*noticed.environment, *(f"{key}={text}" for key, text in values.items())),
             stdin=str(self._place / _TEXT),
             evidence=str(self._place / JSON),
             cell_directory=str(self._scope.cell_directory(self._name)),
@@ -146,7 +156,7 @@ class Sender:
         )
         self._forget(own)
         number = systemd_number(self._manager)
-        properties = transient_commands(notice_properties(wanted, copied, types), number)
+        properties = transient_commands(notice_properties(wanted, copied, noticed.types), number)
         result = self._manager.start_transient(own, properties, None, wait=True)
         return "" if result == JOB_DONE else self._problem(own)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import Manager, queued_job
 from dora_systemd.adapters.host.unit_files import (
     changed_files,
     foreign_file,
@@ -35,12 +35,14 @@ from dora_systemd.decisions.unit.file import (
     without_install,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import unit_name
+from dora_systemd.names import name_from_unit, notice_hold_unit, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import own_directories, wanted_units
 
 _FORGET_SECONDS = 2.0
+_NOTICE_SECONDS = 30.0
+"""TimeoutStartSec= of doranotice@.service."""
 _HELD = ("Transient", "NFileDescriptorStore")
 _RETRY_SECONDS = 0.02
 
@@ -289,22 +291,30 @@ def release_transient(manager: Manager, boot: BootUnit) -> None:
         manager.reload()
 
 
-def wait_until_forgotten(manager: Manager, unit: str) -> None:
+def wait_until_forgotten(manager: Manager, unit: str, most: float = _FORGET_SECONDS) -> None:
     """Wait until a transient unit is gone: systemd unloads it a moment after the last reference.
 
-    What FileDescriptorStorePreserve= keeps of it would keep the unit as well.
+    What FileDescriptorStorePreserve= keeps of it would keep the unit as well. After a failure that
+    is reported, doranotice-hold@.service keeps it for a moment.
     """
-    deadline = time.monotonic() + _FORGET_SECONDS
+    begun = time.monotonic()
     while (facts := manager.read(unit, _HELD))["Transient"]:
         if facts["NFileDescriptorStore"]:
             manager.close_stored(unit)
-        if time.monotonic() > deadline:
+        waited = time.monotonic() - begun
+        if waited > most and not (waited < _NOTICE_SECONDS and _is_held(manager, unit)):
             raise DoraSystemdError(
                 f"cannot start {unit}: systemd still holds the ended one",
                 f"systemctl list-dependencies --reverse {unit}",
                 ExitCode.NAME_IN_USE,
             )
         time.sleep(_RETRY_SECONDS)
+
+
+def _is_held(manager: Manager, unit: str) -> bool:
+    """Whether the unit waits for the service that reports its failure, see noticed.py."""
+    hold = notice_hold_unit(name_from_unit(unit) or "")
+    return bool(queued_job(manager.read(hold, ["Job"])))
 
 
 def _link(manager: Manager, name: str, unit: str) -> None:

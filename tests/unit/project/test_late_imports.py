@@ -22,6 +22,7 @@ LATE = {
         },
     },
     "most notices come without a bundle, which needs all that doctor checks": {
+        "verbs.notice.noticed": {"verbs.bundles.recording"},
         "verbs.notice.send": {"verbs.bundles.write"},
     },
     "a report of what this machine knows reads no bundle": {

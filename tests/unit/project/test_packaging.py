@@ -88,7 +88,7 @@ def test_every_template_is_installed() -> None:
 def test_units_are_fixed_text_with_a_manual(unit: Path) -> None:
     text = unit.read_text()
     if "@" in unit.name:  # systemd replaces %i and %t in a template, see systemd.unit(5)
-        text = re.sub("%[it]|doranotice@", "", text)
+        text = re.sub("%[it]|doranotice(-hold)?@", "", text)
     assert not re.search(r"[{}]|@(?!system-service)|%[a-zA-Z]", text)
     assert re.search(r"^Documentation=man:dora-systemd(-security)?\(7\)$", text, re.M)
 

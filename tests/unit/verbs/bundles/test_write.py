@@ -27,12 +27,8 @@ from dora_systemd.verbs.bundles.write import Failure, write_after, write_bundle
 from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.list import find_row
 from dora_systemd.verbs.why import explain
-from tests.unit.fakes.cgroups import fake_cgroups
-from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
-from tests.unit.fakes.programs import make_dora, make_program
-
-SECRET = "hunter2"
+from tests.unit.verbs.notice.failures import SECRET, fail
 
 Reach = Callable[[Scope], FakeManager]
 
@@ -40,20 +36,7 @@ Reach = Callable[[Scope], FakeManager]
 @pytest.fixture
 def reach(manager: FakeManager, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Reach:
     """A machine on which robot has failed; systemd still has its unit."""
-    fake_cgroups(monkeypatch, tmp_path)
-    journal = FakeJournal(monkeypatch, tmp_path)
-    more = {"_SYSTEMD_INVOCATION_ID": "1", "_CMDLINE": SECRET, "MESSAGE": "it has ended"}
-    failed = {"DORA_EVENT": "dataflow-failed", "DORA_REASON": "node camera: exit code 3"}
-    journal.write(
-        {**life_record("dataflow-failed", 9), **failed, **more},
-        {**life_record("dataflow-starting", 5), **more},
-    )
-    make_dora(tmp_path / "bin/dora", "1.1.0")
-    make_program(tmp_path / "bin/systemd-analyze")
-    monkeypatch.setenv("PATH", f"{tmp_path}/journal:{tmp_path}/bin:/usr/bin:/bin")
-    manager.types = {"NRestarts": "u", "Environment": "as"}
-    manager.add(options(), ActiveState="failed", SubState="failed")
-    manager.units["dora-robot.service"]["Environment"] = [f"KEY={SECRET}"]
+    fail(manager, monkeypatch, tmp_path, options())
 
     def reached(_scope: Scope) -> FakeManager:
         return manager

@@ -1,7 +1,9 @@
 """enable, disable and export against a fake systemd and real files."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -234,6 +236,28 @@ def test_what_descriptors_hold_is_let_go(manager: FakeManager) -> None:
     unit = manager.add(options(), active="inactive", NFileDescriptorStore=6)
     wait_until_forgotten(manager, unit)
     assert ("close", unit) in manager.calls
+
+
+class Held(FakeManager):
+    """A manager that unloads a unit when it has been read often enough."""
+
+    def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+        if self.questions > 20 and unit == UNIT:
+            self.units[unit]["Transient"] = False
+        return super().read(unit, names)
+
+
+@pytest.mark.parametrize("job", [0, 7])
+def test_a_start_waits_for_the_notice_of_a_failure(job: int) -> None:
+    """As long as the service starts that reads the setting of the dataflow, and no longer."""
+    manager = Held()
+    unit = manager.add(options(), active="inactive")
+    manager.units["doranotice-hold@robot.service"] = {"Job": [job, "/"]}
+    if job:
+        wait_until_forgotten(manager, unit, 0)
+        return
+    with pytest.raises(DoraSystemdError, match="systemd still holds the ended one"):
+        wait_until_forgotten(manager, unit, 0)
 
 
 def test_the_target(manager: FakeManager, scope: Scope) -> None:

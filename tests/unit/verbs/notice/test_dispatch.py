@@ -24,10 +24,11 @@ class Bench:
         self.failures, self.last, self.now = failures, last, 0
         self.sent: list[tuple[float, int]] = []
         self.error: DoraSystemdError | None = None
+        self.learned: list[float] = []
 
     def run(self) -> list[tuple[float, int]]:
         """Run the service until it ends: when it has sent notices, and of how many failures."""
-        given = (self.manager, self.scope, "robot", self.read, self.send, self.sleep)
+        given = (self.manager, self.scope, "robot", self.read, self.learn, self.send, self.sleep)
         Dispatcher(*given, lambda: self.now).run()
         return self.sent
 
@@ -39,6 +40,10 @@ class Bench:
         times = [int(one * SECOND) for one in self.failures]
         new = [Happened("failed", one, one) for one in times if since < one <= self.now]
         return new[::-1], self.last
+
+    def learn(self) -> None:
+        """Read the setting."""
+        self.learned.append(self.now / SECOND)
 
     def send(self, happened: Sequence[Happened], pause_us: int) -> None:
         """Send, and record that."""
@@ -68,8 +73,10 @@ def test_a_storm_is_few_notices_that_count(tmp_path: Path) -> None:
 
 
 def test_a_pause_that_a_former_process_began(tmp_path: Path) -> None:
+    """In it the dataflow may be stopped."""
     bench = Bench(tmp_path, [0.0], Sent(-5 * SECOND, -5 * SECOND, 15 * SECOND))
     assert bench.run() == [(10.0, 1)]
+    assert bench.learned[0] == 1.0
 
 
 def test_a_failure_while_the_service_ends(tmp_path: Path) -> None:

@@ -1,0 +1,119 @@
+"""A notice is about the dataflow as it was when it failed, whatever has become of its unit."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.bundles.reader import opened
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.notice.happened import FAILED, Happened
+from dora_systemd.decisions.recorder.record import Record
+from dora_systemd.decisions.recorder.writer import Writer
+from dora_systemd.runner.recorder.keep import fitted_ring, header_of
+from dora_systemd.runner.recorder.record import FileStore
+from dora_systemd.verbs.bundles.listing import read_bundles
+from dora_systemd.verbs.notice.send import Sender
+from tests.unit.decisions.recorder.test_pictures import BATCH, SCHEMA
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options, with_texts
+from tests.unit.fakes.notes import Notes
+from tests.unit.fakes.recorder.ring import PAGE, message
+from tests.unit.verbs.notice.failures import SECRET, fail
+
+UNIT, COMMAND = "dora-robot.service", "doranotice-robot.service"
+HAPPENED = [Happened(FAILED, 9, 9, "camera", "node camera: exit code 3")]
+Robot = Callable[..., Sender]
+
+
+@pytest.fixture
+def robot(manager: FakeManager, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Robot:
+    """Lets robot fail, with settings as texts; the service that sends its notices."""
+
+    def failed(*texts: str, is_user: bool = False) -> Sender:
+        fail(manager, monkeypatch, tmp_path, with_texts(options(), *texts))
+        scope = ScopeIn(is_user, os.getuid(), tmp_path / "run")
+        (tmp_path / "place").mkdir()
+        return Sender(manager, scope, "robot", JournalReader(), tmp_path / "place")
+
+    return failed
+
+
+@pytest.fixture
+def notes(monkeypatch: pytest.MonkeyPatch) -> Notes:
+    return Notes(monkeypatch)
+
+
+def events(notes: Notes) -> list[tuple[str, ...]]:
+    return notes.found("DORA_EVENT", "DORA_REASON", "DORA_DATAFLOW")
+
+
+def test_a_dataflow_that_is_stopped_before_its_notice(
+    robot: Robot, manager: FakeManager, notes: Notes
+) -> None:
+    """The command runs as it would have, and a bundle is written."""
+    sender = robot("on_failure=/bin/tell x", "black_box=yes")
+    sender.learn()
+    del manager.units[UNIT]
+    sender.learn()
+    sender.send(HAPPENED, 15)
+    command = manager.units[COMMAND]
+    assert command["User"] == "alice"
+    assert f"KEY={SECRET}" in command["Environment"]
+    written, sent = events(notes)
+    assert written[0] == "bundle-written"
+    assert sent[0] == "notice-sent"
+    assert sent[1].endswith(" failed: node camera: exit code 3")
+    assert sent[2] == options().uuid
+
+
+def test_another_dataflow_of_that_name_without_the_setting(
+    robot: Robot, manager: FakeManager, notes: Notes
+) -> None:
+    """The failure was before that."""
+    sender = robot("on_failure=/bin/tell x")
+    sender.learn()
+    manager.add(options(uuid="550e8400-e29b-41d4-a716-446655440001"))
+    sender.learn()
+    sender.send(HAPPENED, 15)
+    ((event, _, uuid),) = events(notes)
+    assert (event, uuid) == ("notice-sent", options().uuid)
+
+
+@pytest.mark.parametrize(
+    ("is_loaded", "reason"),
+    [
+        (True, "the dataflow has no on_failure any more"),
+        (False, f"systemd had unloaded {UNIT} before its setting was read"),
+    ],
+)
+def test_why_there_is_no_notice(
+    robot: Robot, manager: FakeManager, notes: Notes, is_loaded: bool, reason: str
+) -> None:
+    sender = robot()
+    if not is_loaded:
+        del manager.units[UNIT]
+    sender.learn()
+    sender.send(HAPPENED, 15)
+    assert [one[:2] for one in events(notes)] == [("notice-failed", reason)]
+    assert COMMAND not in manager.units
+
+
+def test_the_last_messages_are_those_at_the_failure(
+    robot: Robot, manager: FakeManager, tmp_path: Path
+) -> None:
+    """systemd gives the memory of a recorder back when the dataflow is stopped or started again."""
+    sender = robot("black_box=yes", "record=yes", is_user=True)
+    ring = fitted_ring(-1, header_of(Record(), ["camera/image"], {"uuid": options().uuid}))
+    Writer(FileStore(ring), PAGE).put(0, message(BATCH, 5, SCHEMA))
+    manager.units[UNIT]["MainPID"] = os.getpid()
+    sender.learn()
+    manager.units[UNIT]["MainPID"] = 0
+    os.close(ring)
+    sender.send(HAPPENED, 15)
+    (row,) = read_bundles(ScopeIn(True, os.getuid(), tmp_path / "run"), ["robot"])
+    with opened(Path(row.file)) as bundle:
+        assert "recording.mcap" in [one.name for one in bundle.manifest.parts]
+        assert BATCH in bundle.read("recording.mcap")
+    left = [str(one.readlink()) for one in Path("/proc/self/fd").iterdir() if one.exists()]
+    assert not [one for one in left if "dora-ring" in one], "its memory is free"
