@@ -52,6 +52,10 @@ stops:  ## STOPS=n stops of all kinds, and what a recorder loses; LAB=vm restart
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@STOPS=$(STOPS) $(CHECK) stops
 
+kills:  ## kill -9 beside a recorder, ROUNDS=n times, and which messages a bundle has; SEED=n
+	@$(PREPARE) container
+	@ROUNDS=$(ROUNDS) SEED=$(SEED) $(CHECK) kills
+
 power:  ## the power fails ROUNDS=n times in the middle of a deploy or rollback; SEED=n
 	@$(PREPARE) container vm
 	@ROUNDS=$(ROUNDS) SEED=$(SEED) $(CHECK) power

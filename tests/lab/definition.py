@@ -24,7 +24,7 @@ PACKAGES = [
 
 PYPI = [
     "dora-rs-cli==1.1.0", "dora-rs==1.1.0", "pyarrow", "uv", "pytest", "pytest-timeout",
-    "hypothesis",
+    "hypothesis", "mcap",
 ]  # fmt: skip
 
 # For nodes that say so by PYTHONPATH. pyarrow imports numpy where it finds it, and a node that

@@ -35,10 +35,11 @@ CONTAINERS = 3
 # A machine may have half of the speed, and images are built in the minutes of the first that asks.
 PATIENCE = 5
 LEAST_LONGEST = 20
-# Unit tests that need mandoc, fish or zsh, which the lab has.
+# Unit tests that need mandoc, fish, zsh, mcap or pyarrow, which the lab has.
 WITH_TOOLS = (
     "tests/unit/cli/test_completions.py",
     "tests/unit/decisions/dora/test_command.py",
+    "tests/unit/decisions/recorder/test_mcap.py",
     "tests/unit/project/test_manpages.py",
 )
 # Stops between two restarts of a machine, which come after other kinds of stops each time.
@@ -284,6 +285,13 @@ def plan_stops(form: str) -> list[Step]:
     return [Step(f"stops, {form}", command, in_lab(form))]
 
 
+def plan_kills(_form: str) -> list[Step]:
+    """Processes of a dataflow with a recorder are killed, as often as ROUNDS says."""
+    words = [os.environ.get("ROUNDS") or "40", os.environ.get("SEED") or "1"]
+    command = ["tests/lab/lab", "run", "--", "python", "-m", "tests.system.recorder_kills", *words]
+    return [Step("kills beside a recorder, container", command, in_lab("container"))]
+
+
 def plan_power(_form: str) -> list[Step]:
     """The power fails in the middle of deploys and rollbacks, as often as ROUNDS says."""
     words = [os.environ.get("ROUNDS") or "10", os.environ.get("SEED") or "1"]
@@ -391,6 +399,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "faults": plan_faults,
     "history": plan_history,
     "stops": plan_stops,
+    "kills": plan_kills,
     "power": plan_power,
     "canary": plan_canary,
     "fuzz": plan_fuzz,

@@ -3,8 +3,6 @@
 import io
 import json
 import os
-import random
-import signal
 import tarfile
 from functools import partial
 from pathlib import Path
@@ -241,41 +239,3 @@ def test_a_bundle_has_the_messages_and_pictures(cell: Cell, project: Project) ->
     cell.doractl("bundle", cell.name, "-o", str(bundle), "--no-journal")
     with tarfile.open(bundle) as archive:
         assert not [one for one in archive.getnames() if "recording" in one]
-
-
-ROUNDS = int(os.environ.get("KILLS", "4"))
-KILLED = (
-    *("killed", "signal", "SIGKILL", "is lost", "failed", "crashed", "restart"),
-    *("exited with error", "Failed with result", "nobody records", LARGE, "connection"),
-)
-
-
-def victim(cell: Cell, who: str) -> int:
-    """The process to kill, 0 if it does not run."""
-    if who == "recorder":
-        return next(iter(cell.pids("node-dora-systemd-recorder")), 0)
-    if who == "node":
-        return cell.status.nodes["camera"].pid
-    return cell.supervisor_pid(who)
-
-
-@pytest.mark.warns(*KILLED)
-@pytest.mark.parametrize("who", ["recorder", "node", "daemon", "runner"])
-def test_after_a_kill_it_is_all_there(cell: Cell, project: Project, who: str) -> None:
-    path = flow(project, {"memory": "8M", "outputs": ["camera/image", "camera/count"]})
-    words = "--restart-policy", "on-failure", "--max-restarts", "100000", "--restart-delay", "500ms"
-    start(cell, path, *words)
-    last, seed = 0, random.Random(who)
-    for _ in range(ROUNDS):
-        more = last + seed.randrange(10, 40)
-        wait_for("it records", partial(has_more, more), 120)  # the delay of restarts grows
-        pid = wait_for("it runs", lambda: victim(cell, who))
-        before = Ring().last()
-        os.kill(pid, signal.SIGKILL)
-        ring = Ring()
-        reading = ring.reading()
-        messages = list(reading.messages())
-        last = messages[-1].head.number
-        received = sum(one.received for one in reading.states)
-        assert (last >= before, received - last in (0, 1), reading.damaged) == (True, True, 0)
-        file_of(ring)

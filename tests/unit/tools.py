@@ -1,6 +1,9 @@
 """Programs that some unit tests ask for a second opinion, and that not every machine has."""
 
+import importlib
+import importlib.util
 import shutil
+from typing import Any
 
 import pytest
 
@@ -15,3 +18,11 @@ def require(tool: str) -> None:
     if not shutil.which(tool):
         assert not IN_LAB, f"the lab has no {tool}"
         pytest.skip(f"no {tool} here; the lab has it")
+
+
+def require_module(name: str) -> Any:
+    """Import a module of PyPI; skips where it is missing, and in the lab it must be there."""
+    if not importlib.util.find_spec(name.partition(".")[0]):
+        assert not IN_LAB, f"the lab has no {name}"
+        pytest.skip(f"no {name} here; the lab has it")
+    return importlib.import_module(name)

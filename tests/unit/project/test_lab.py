@@ -41,7 +41,7 @@ def test_the_lab_runs_what_is_skipped_without_its_programs() -> None:
     asking = {
         str(one.relative_to(definition.CHECKOUT))
         for one in tests
-        if "\nfrom tests.unit.tools import require\n" in one.read_text()
+        if "\nfrom tests.unit.tools import require" in one.read_text()
     }
     assert asking == set(WITH_TOOLS)
     assert all(asking <= set(step.command) for step in PLANS["other-python"]("container"))

@@ -13,6 +13,7 @@ from dora_systemd.decisions.recorder.writer import Message
 from tests.unit.checkout import CHECKOUT
 from tests.unit.fakes.recorder.mcap import File
 from tests.unit.fakes.recorder.ring import PAGE, MemoryStore, message, ring, writer
+from tests.unit.tools import require_module
 
 NOW = 1_790_000_000_000_000_000
 
@@ -104,8 +105,8 @@ def ten_lines(path: str) -> list[Any]:
 
 
 def test_the_file_is_read_by_mcap_and_pyarrow(tmp_path: Any) -> None:
-    arrow = pytest.importorskip("pyarrow")
-    reader = pytest.importorskip("mcap.reader")
+    arrow, reader = require_module("pyarrow"), require_module("mcap.reader")
+    stream = require_module("mcap.stream_reader")
     values = arrow.array(range(1000), arrow.int32()), arrow.array(["a"])
     store, _ = ring(budget=64 * PAGE, facts={"dataflow": "arm"})
     one = writer(store)
@@ -125,3 +126,9 @@ def test_the_file_is_read_by_mcap_and_pyarrow(tmp_path: Any) -> None:
         assert checked.get_summary().statistics.message_count == 4
         assert [one.name for one in checked.iter_metadata()][-1] == "dora-systemd"
         assert len(list(checked.iter_messages())) == 4
+    data = path.read_bytes()
+    assert len([*stream.StreamReader(io.BytesIO(data), validate_crcs=True).records]) > 4
+    place = data.index(b'{"a": 1}')
+    damaged = data[:place] + b"[" + data[place + 1 :]
+    with pytest.raises(stream.CRCValidationError):
+        list(stream.StreamReader(io.BytesIO(damaged), validate_crcs=True).records)
