@@ -8,6 +8,9 @@ from dora_systemd.scope import NOTICE_NAME
 
 _UNIT_PATH_HINT = "systemctl show --property UnitPath; is SYSTEMD_UNIT_PATH set for systemd?"
 
+LAST_REQUEST = "last"
+"""The file, in the directory of request_file(), of a runner whose dataflow has finally failed. The
+runner ends when it is removed: then the ring of the recorder is open."""
 TABLE = "status.json"
 """The live node table of a cell, in the RuntimeDirectory of its unit."""
 

@@ -123,6 +123,11 @@ async def run_cell(
         is_over = clock.by or (end is RunnerExit.OK and restart_of(options).policy != "always")
         if is_over and options.has("record"):
             fd_store.forget_all(pipes.kept)
+        elif options.has("record") and not fd_store.outlasts_failure():
+            # Imported late: only systemd before 254 needs it.
+            from dora_systemd.runner.cell.notices import hand_over_ring
+
+            hand_over_ring(options, RunnerExit.RESTARTS_SPENT if spent else end)
 
 
 class Runs:

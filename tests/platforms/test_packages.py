@@ -4,6 +4,7 @@ import json
 import pwd
 import re
 import shutil
+import tarfile
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,10 +18,12 @@ from tests.deb.packages import install
 from tests.platforms.table import HERE
 from tests.system.cells import Project, dora_processes, run, wait_for, wait_no_process
 from tests.system.tolerated import is_tolerated
+from tests.unit.fakes.recorder.mcap import File
 
 LAB = "/opt/lab"
 """The environment of the tests, which is that of the nodes too."""
 USERS = ("root", "alice")
+RECORD = ("--black-box", "yes", "--record", "yes")
 PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 
 
@@ -232,6 +235,55 @@ def test_a_notice_of_a_failure(user: str, flow: Path) -> None:
     text = wait_for("the notice", lambda: (place / "notice").exists() and (place / "notice"))
     assert "DORA_NOTICE_EVENT=node-given-up\n" in text.read_text()
     assert "DORA_NOTICE_NODE=sink\n" in text.read_text()
+
+
+RECORDED = """
+import os, sys
+import pyarrow as pa
+from dora import Node
+node = Node()
+for number, event in enumerate(node):
+    if event["type"] == "INPUT":
+        node.send_output("count", pa.array([number]))
+        print(number, flush=True)
+        if os.path.exists("fail"):
+            sys.exit(3)
+"""
+
+
+def recorded(bundle: Path) -> list[int]:
+    """The numbers that node.py has sent, by the recording of a bundle."""
+    with tarfile.open(bundle) as archive:
+        names = archive.getnames()
+        file = archive.extractfile("recording.mcap") if "recording.mcap" in names else None
+        messages = File(file.read()).messages if file else []
+    return [one.data[-8] + 256 * one.data[-7] for one in messages]
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_a_failure_leaves_the_last_messages(user: str, flow: Path) -> None:
+    """Before systemd 254 the memory of the recorder is gone when the unit has failed."""
+    project = Project(flow.parent, is_new=False)
+    project.write("node.py", RECORDED)
+    node = "{id: talker, path: node.py, inputs: {t: dora/timer/millis/20}, outputs: [count]}"
+    start(user, project.write("alone.yml", f"nodes: [{node}]\n"), *RECORD)
+    file = Path(tempfile.mkdtemp(prefix="bundle-", dir="/var/tmp")) / "robot.tar"
+    shutil.chown(file.parent, user)
+
+    def is_recorded() -> bool:
+        doractl(user, "bundle", "robot", "-o", str(file))
+        return bool(recorded(file))
+
+    wait_for("it is recorded", is_recorded)
+    shutil.rmtree(file.parent)
+    project.write("fail", "")
+    wait_for("it has failed", lambda: show(user, "ActiveState") == "failed")
+    bundles = ("bundles", "robot", "-o", "json")
+    (written,) = wait_for("its bundle", lambda: json.loads(doractl(user, *bundles).stdout))
+    last = max(int(one) for one in lines(user, "talker") if one.isdigit())
+    assert written["event"] == "failed"
+    assert last - 5 <= recorded(Path(written["file"]))[-1] <= last
+    doractl(user, "bundles", "robot", "--remove", written["bundle"])
 
 
 @pytest.mark.parametrize("user", USERS)

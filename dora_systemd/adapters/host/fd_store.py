@@ -96,13 +96,18 @@ def count_life(began_us: int) -> None:
         os.close(fd)
 
 
+def outlasts_failure() -> bool:
+    """Whether systemd has FileDescriptorStorePreserve=: 254 has, and sets $FDSTORE."""
+    return "FDSTORE" in os.environ
+
+
 def is_first_life() -> bool:
     """Whether no life before this one has counted itself since systemd loaded the unit.
 
     False also if systemd is older than 254 and does not set $FDSTORE, see systemd.exec(5): then
     systemd may keep no descriptors.
     """
-    return "FDSTORE" in os.environ and not os.environ.get("LISTEN_FDNAMES")
+    return outlasts_failure() and not os.environ.get("LISTEN_FDNAMES")
 
 
 def forget_lives() -> None:

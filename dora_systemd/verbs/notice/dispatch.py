@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.query import notice_matches, sent_matches
@@ -20,14 +20,20 @@ from dora_systemd.decisions.notice.happened import (
     read_story,
 )
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.names import notice_unit
+from dora_systemd.names import notice_unit, unit_name
+from dora_systemd.paths import LAST_REQUEST
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import exists
 from dora_systemd.trust.requests import clear_directory
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.lives import now_boot
 
 SETTLE_SECONDS = 1.0
 """Failures come together, and journald may not have written them yet."""
+
+END_SECONDS = 10
+"""Longest time between the last request of a runner and the failure of its unit."""
+POLL_SECONDS = 0.2
 
 Send = Callable[[Sequence[Happened], int], None]
 """Sends a notice of failures, newest first, and records it with the pause that follows, in µs."""
@@ -89,8 +95,11 @@ class Dispatcher:
 
     def _work(self) -> bool:
         """Send one notice, or wait until it may be sent; whether there was anything to report."""
+        is_last = exists(self._scope.notice_directory(self._name) / LAST_REQUEST)
         self._learn()
         self._clear_requests()
+        if is_last:
+            self._await_end()
         try:
             happened, last = self._read()
         except DoraSystemdError as error:
@@ -104,6 +113,16 @@ class Dispatcher:
         self._send(happened, next_pause(last, self._now_us()))
         self._sleep(SETTLE_SECONDS)  # journald has to write the record of this notice
         return True
+
+    def _await_end(self) -> None:
+        """Wait for the final failure of the unit, see runner/cell/notices.py."""
+        unit, deadline = unit_name(self._name), self._now_us() + END_SECONDS * SECOND
+        with suppress(DoraSystemdError):
+            while self._manager.read(unit, ["ActiveState"])["ActiveState"] not in DOWN:
+                if self._now_us() > deadline:
+                    return
+                self._sleep(POLL_SECONDS)
+        self._sleep(SETTLE_SECONDS)
 
     def _send_unread(self, error: DoraSystemdError) -> None:
         """Send a notice of a failure that the journal does not show, and keep the pause here."""

@@ -11,8 +11,9 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.requests import clear_directory
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.notice.dispatch import Dispatcher
-from tests.unit.fakes.manager import FakeManager, ScopeIn
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
+UNIT = "dora-robot.service"
 AGAIN = [("StartUnit", "doranotice@robot.service")]
 
 
@@ -25,6 +26,7 @@ class Bench:
         self.sent: list[tuple[float, int]] = []
         self.error: DoraSystemdError | None = None
         self.learned: list[float] = []
+        self.manager.add(options())
 
     def run(self) -> list[tuple[float, int]]:
         """Run the service until it ends: when it has sent notices, and of how many failures."""
@@ -53,6 +55,8 @@ class Bench:
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
         self.now += int(seconds * SECOND)
+        if any(one * SECOND <= self.now for one in self.failures):
+            self.manager.units[UNIT]["ActiveState"] = "failed"
 
 
 def test_one_failure_is_one_notice(tmp_path: Path) -> None:
@@ -102,6 +106,18 @@ def test_requests_are_removed_first(tmp_path: Path) -> None:
     (directory / "request").touch()
     bench.run()
     assert not list(directory.iterdir())
+
+
+@pytest.mark.parametrize(("fails_at", "sent"), [(3.0, [4]), (60.0, [])])
+def test_a_runner_that_ends_for_good(tmp_path: Path, fails_at: float, sent: list[int]) -> None:
+    """Its unit fails when the service has removed the request: it is reported at once."""
+    bench = Bench(tmp_path, [fails_at])
+    directory = bench.scope.notice_directory("robot")
+    directory.mkdir(parents=True)
+    (directory / "last").touch()
+    assert [int(moment) for moment, _ in bench.run()] == sent
+    assert not list(directory.iterdir())
+    assert bench.now < 20 * SECOND
 
 
 def test_what_cannot_be_removed_does_not_start_it_for_ever(tmp_path: Path) -> None:
