@@ -183,7 +183,8 @@ def start_reader(
 def cannot_reach(user: str, path: str) -> DoraSystemdError:
     """The error for a path that the user of a dataflow cannot access."""
     message = f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}"
-    hint = "put it where that user can read it, or choose another user with --uid"
+    way = "move it, chmod a+rX what is closed, or choose another user with --uid"
+    hint = f"see namei -l {shown(path)}: {way}"
     return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
 
 

@@ -137,7 +137,8 @@ def test_an_interpreter_that_the_account_cannot_reach() -> None:
         f"cannot start the dataflow as user {name}, who cannot reach {sys.executable}"
     )
     assert caught.value.hint == (
-        "put it where that user can read it, or choose another user with --uid"
+        f"see namei -l {sys.executable}: move it, chmod a+rX what is closed, "
+        "or choose another user with --uid"
     )
     assert caught.value.code is ExitCode.NO_PERMISSION
 
