@@ -56,8 +56,6 @@ def test_units_in_use_are_good(front: Front) -> None:
     front.up()
     paths = [front.show("FragmentPath", unit) for unit in (SOCKET_UNIT, SERVICE_UNIT)]
     assert run("systemd-analyze", "verify", "--man=no", *paths).stderr == ""
-    shown = run("systemd-analyze", "security", "--no-pager", SERVICE_UNIT).stdout
-    assert float(shown.split("level for")[1].split()[1]) < 3.0
     assert front.show("ControlGroup") == f"/dora.slice/{SERVICE_UNIT}"
 
 
