@@ -27,9 +27,11 @@ AGAIN = ("failed to connect to dora-coordinator", "Could not connect to WS at")
 BUSY = (
     *("node exited with error: Signal(15)", "State 'stop-post' timed out"),
     *("failed to send log message to dora-coordinator", "WS send channel closed"),
+    "Received Data for unknown expr_id",
 )
 """Of a machine that gives a node too little time within the grace, or systemd's last command, or
-whose daemon still has something to report when the coordinator of the head has ended."""
+whose daemon still has something to report when the coordinator of the head has ended, or receives a
+message of a node that was killed before it knows the name of the output."""
 
 
 def _journalctl(machine: str, *words: str) -> str:

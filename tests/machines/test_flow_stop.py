@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.errors import ExitCode
+from tests.lab.pace import pace
 from tests.machines.flows import NAME, PLACE, Flow, flow_on
 from tests.machines.journals import BUSY, announced, killed, lost
 from tests.machines.wires import clear, power_cut, there
@@ -53,7 +54,8 @@ class Stops(Flow):
         place = Project(Path(PLACE), is_new=False)
         place.write("source.py", SOURCE)
         place.write("recorder.py", RECORDER)
-        place.write("seconds", str(self.seconds))
+        # Long enough for a busy machine to list it, and well within the time that it is given.
+        place.write("seconds", str(round(self.seconds * min(max(pace(), 1), 2.5))))
         Path(PLACE, "extend").unlink(missing_ok=True)
         if self.extends:
             place.write("extend", "")
