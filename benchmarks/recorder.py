@@ -16,6 +16,7 @@ from benchmarks.rounds import OURS, Figure, keep, shown, take_turns
 from tests.system.cells import Cell, Project, run, wait_for
 
 SECONDS = 6.0
+RECORD = "last=10s,memory=200M"
 RECORDER = "node-dora-systemd-recorder"
 STREAMS = {"1 MB at 30 Hz": (1_000_000, 33), "64 B at 500 Hz": (64, 2)}
 """Bytes of a message, and milliseconds between two."""
@@ -41,7 +42,8 @@ with open(sys.argv[1], "w", buffering=1) as file:
 STREAM = """
   - {{id: sender-{size}, path: sender.py, args: "{size}",
      inputs: {{tick: dora/timer/millis/{pause}}}, outputs: [data]}}
-  - {{id: receiver-{size}, path: receiver.py, args: "{file}", inputs: {{data: sender-{size}/data}}}}
+  - {{id: receiver-{size}, path: receiver.py, args: "{file}",
+     inputs: {{data: {{source: sender-{size}/data, queue_size: 100}}}}}}
 """
 WITHOUT = "not recorded"
 
@@ -92,10 +94,10 @@ def measure(rounds: int) -> list[Figure]:
     project.write("sender.py", SENDER)
     project.write("receiver.py", RECEIVER)
     cell = Cell("recorder")
-    words = ("--writable", str(STAMPS), "--name", cell.name)
+    words = ("--writable", str(STAMPS), "--name", cell.name, "--record", RECORD)
     run("doractl", "start", str(flow(project)), *words)
     wait_for("messages flow", lambda: all(count(size) for size, _ in STREAMS.values()))
-    contestants = {OURS: partial(turn, cell, costs, "last=10s,memory=200M")}
+    contestants = {OURS: partial(turn, cell, costs, RECORD)}
     contestants[WITHOUT] = partial(turn, cell, costs, "off")
     found = take_turns(contestants, rounds)
     cell.end()
