@@ -77,7 +77,8 @@ def switch_record(
     """
     require_running(cell)
     refuse_parts([cell], "set")
-    what, has_recorder = format_record(parse_record(text)), cell.options.has("record")
+    record, has_recorder = parse_record(text), cell.options.has("record")
+    what = format_record(record)
     unit = manager.read(cell.unit, ("Environment", "FragmentPath", "Transient"))
     with ExitStack() as undo:
         remember(unit, [SettingText("", "record", what)], undo)
@@ -85,7 +86,9 @@ def switch_record(
         if has_recorder:
             ask(socket_of(scope, cell), {"verb": "record", "what": what})
         undo.pop_all()
-    return () if has_recorder else (f"{cell.name} was started without record: restart it",)
+    if has_recorder or record is None:
+        return ()
+    return (f"{cell.name} was started without record: restart it",)
 
 
 def remember(unit: Mapping[str, Any], changes: Iterable[SettingText], undo: ExitStack) -> None:

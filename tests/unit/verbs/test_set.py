@@ -20,7 +20,7 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell, read_cell
-from dora_systemd.verbs.reload import switch_hot_reload
+from dora_systemd.verbs.reload import switch_hot_reload, switch_record
 from dora_systemd.verbs.set import set_limits
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.limit_values import limits_from
@@ -128,6 +128,16 @@ def test_hot_reload_is_remembered_beside_the_limits(place: Place) -> None:
     switch_hot_reload(place.manager, place.scope, place.cell, False, lambda *_: {})
     variable = "DORA_SYSTEMD_SET=camera:cpu_limit=150%% hot_reload=no"
     assert f'Environment="{variable}"' in place.drop_in.read_text()
+
+
+@pytest.mark.parametrize(("text", "warns"), [("off", False), ("memory=4M", True)])
+def test_a_recorder_that_was_not_started_needs_a_restart(
+    place: Place, text: str, warns: bool
+) -> None:
+    found = switch_record(place.manager, place.scope, place.cell, text, lambda *_: {})
+    expected = (f"{place.cell.name} was started without record: restart it",)
+    assert found == (expected if warns else ())
+    assert "record=" in place.drop_in.read_text()
 
 
 def test_what_is_too_small_or_too_large_is_said(place: Place) -> None:
