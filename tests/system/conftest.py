@@ -202,7 +202,7 @@ def browser(front: Front, gateway_up: None, cell: Cell) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[Browser]:
-    """The same for a module of tests that need no dataflow, but scripts of the page."""
+    """One page for all tests of a module that run the page's scripts and need no dataflow."""
     front = Front()
     front.up()
     with page_of(front) as browser:

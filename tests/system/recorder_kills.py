@@ -69,7 +69,7 @@ class Round(NamedTuple):
 
     who: str
     missing: int  # messages that the recorder had received
-    behind: int  # messages that another node had received, beside it
+    behind: int  # messages that the node `sink` had received and the bundle lacks
     wrong: tuple[str, ...]
 
     def __str__(self) -> str:

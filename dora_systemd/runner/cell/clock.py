@@ -1,7 +1,8 @@
 """Time in a cell: the clock of a stop, lost time, and the messages to the watchdog of systemd.
 
-While nothing happens, the process wakes up at the ticks only, twice within WatchdogSec=, and each
-time once more for the answer of dora. Before Python 3.13 the thread for the watchdog wakes up, too.
+While nothing happens, the process wakes up only at the ticks. There are two ticks within
+WatchdogSec=, and dora's answer to each tick wakes the process once more. Before Python 3.13 each
+tick also wakes the thread of the watchdog.
 """
 
 import asyncio

@@ -58,7 +58,7 @@ def test_properties_that_systemd_lacks(version: str, names: list[str]) -> None:
 
 
 def test_an_old_systemd_needs_two_lines_of_a_small_terminal() -> None:
-    """Its name and its remedy, with the longest topic beside it."""
+    """The finding fits into two lines of 80 columns, also where another topic is long."""
     both = [judge_systemd("252.39-1~deb12u2"), Finding("port 53290", State.OK, "free")]
     assert len(format_findings(both, 80).splitlines()) == 3
 
