@@ -45,6 +45,27 @@ SOURCE_YAML = """nodes:
   - {id: source, path: source.py, inputs: {tick: dora/timer/millis/10}, outputs: [number]}
 """
 SINK_YAML = "  - {{id: sink-{}, path: sink.py, inputs: {{number: source/number}}}}\n"
+STREAM_SENDER = """
+import sys, time
+from dora import Node
+import pyarrow
+size = int(sys.argv[1])
+buffers = [None, pyarrow.py_buffer(bytes(size))]
+node, data = Node(), pyarrow.Array.from_buffers(pyarrow.uint8(), size, buffers)
+for event in node:
+    if event["type"] == "INPUT":
+        node.send_output("data", data, {"sent": time.monotonic_ns()})
+"""
+"""Sends so many bytes at each tick."""
+STREAM_RECEIVER = """
+import sys, time
+from dora import Node
+with open(sys.argv[1], "w", buffering=1) as file:
+    for event in Node():
+        if event["type"] == "INPUT":
+            print(time.monotonic_ns() - event["metadata"]["sent"], file=file)
+"""
+"""Writes how long each message was on its way, in ns, into a file."""
 
 
 class Stamp(NamedTuple):

@@ -11,36 +11,19 @@ import time
 from pathlib import Path
 
 from benchmarks.cost import cpu_seconds, private_mb
-from benchmarks.flows import STAMPS, clear_stamps, make_home
+from benchmarks.flows import STAMPS, STREAM_RECEIVER, STREAM_SENDER, clear_stamps, make_home
 from benchmarks.rounds import OURS, Figure, keep, shown
 from dora_systemd.decisions.cell.owes import PROBE
 from tests.system.cells import Cell, Project, run, wait_for
 
 SECONDS = 10.0
-SENDER = """
-import time
-from dora import Node
-import pyarrow
-buffers = [None, pyarrow.py_buffer(bytes(1_000_000))]
-node, data = Node(), pyarrow.Array.from_buffers(pyarrow.uint8(), 1_000_000, buffers)
-for event in node:
-    if event["type"] == "INPUT":
-        node.send_output("image", data, {"sent": time.monotonic_ns()})
-"""
-RECEIVER = """
-import os, sys, time
-from dora import Node
-with open(sys.argv[1], "w", buffering=1) as file:
-    for event in Node():
-        if event["type"] == "INPUT":
-            print(time.monotonic_ns() - event["metadata"]["sent"], file=file)
-"""
 YAML = """nodes:
-  - {{id: sender, path: sender.py, inputs: {{tick: dora/timer/millis/33}}, outputs: [image]}}
-  - {{id: receiver, path: receiver.py, args: {file}, inputs: {{image: sender/image}}}}
+  - {{id: sender, path: sender.py, args: "1000000",
+     inputs: {{tick: dora/timer/millis/33}}, outputs: [data]}}
+  - {{id: receiver, path: receiver.py, args: {file}, inputs: {{data: sender/data}}}}
 """
 PLAIN = "not watched"
-FLAGS = {OURS: ("--node", "sender:owes=image:within=5s"), PLAIN: ()}
+FLAGS = {OURS: ("--node", "sender:owes=data:within=5s"), PLAIN: ()}
 
 
 def stamps(name: str) -> Path:
@@ -67,8 +50,8 @@ def measure(rounds: int) -> list[Figure]:
     """Latency of both; memory and CPU time of the probe."""
     project = make_home()
     clear_stamps()
-    project.write("sender.py", SENDER)
-    project.write("receiver.py", RECEIVER)
+    project.write("sender.py", STREAM_SENDER)
+    project.write("receiver.py", STREAM_RECEIVER)
     cells = {name: start(project, name) for name in FLAGS}
     ours = cells[OURS]
     wait_for("it is heard", lambda: has_age(ours))

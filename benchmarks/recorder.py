@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.cost import cpu_seconds, private_mb
-from benchmarks.flows import STAMPS, clear_stamps, make_home
+from benchmarks.flows import STAMPS, STREAM_RECEIVER, STREAM_SENDER, clear_stamps, make_home
 from benchmarks.rounds import OURS, Figure, keep, shown, take_turns
 from tests.system.cells import Cell, Project, run, wait_for
 
@@ -20,25 +20,6 @@ RECORD = "last=10s,memory=200M"
 RECORDER = "node-dora-systemd-recorder"
 STREAMS = {"1 MB at 30 Hz": (1_000_000, 33), "64 B at 500 Hz": (64, 2)}
 """Bytes of a message, and milliseconds between two."""
-SENDER = """
-import sys, time
-from dora import Node
-import pyarrow
-size = int(sys.argv[1])
-buffers = [None, pyarrow.py_buffer(bytes(size))]
-node, data = Node(), pyarrow.Array.from_buffers(pyarrow.uint8(), size, buffers)
-for event in node:
-    if event["type"] == "INPUT":
-        node.send_output("data", data, {"sent": time.monotonic_ns()})
-"""
-RECEIVER = """
-import sys, time
-from dora import Node
-with open(sys.argv[1], "w", buffering=1) as file:
-    for event in Node():
-        if event["type"] == "INPUT":
-            print(time.monotonic_ns() - event["metadata"]["sent"], file=file)
-"""
 STREAM = """
   - {{id: sender-{size}, path: sender.py, args: "{size}",
      inputs: {{tick: dora/timer/millis/{pause}}}, outputs: [data]}}
@@ -91,8 +72,8 @@ def measure(rounds: int) -> list[Figure]:
     """Latency of both streams; memory and CPU time of the recorder."""
     project, costs = make_home(), list[tuple[float, float]]()
     clear_stamps()
-    project.write("sender.py", SENDER)
-    project.write("receiver.py", RECEIVER)
+    project.write("sender.py", STREAM_SENDER)
+    project.write("receiver.py", STREAM_RECEIVER)
     cell = Cell("recorder")
     words = ("--writable", str(STAMPS), "--name", cell.name, "--record", RECORD)
     run("doractl", "start", str(flow(project)), *words)

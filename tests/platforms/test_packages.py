@@ -17,8 +17,8 @@ from dora_systemd.decisions.properties.table import TABLE_VERSION
 from tests.deb.packages import install
 from tests.platforms.table import HERE
 from tests.system.cells import Project, dora_processes, run, wait_for, wait_no_process
+from tests.system.recorders import COUNTING, counted
 from tests.system.tolerated import is_tolerated
-from tests.unit.fakes.recorder.mcap import File
 
 LAB = "/opt/lab"
 """The environment of the tests, which is that of the nodes too."""
@@ -237,34 +237,19 @@ def test_a_notice_of_a_failure(user: str, flow: Path) -> None:
     assert "DORA_NOTICE_NODE=sink\n" in text.read_text()
 
 
-RECORDED = """
-import os, sys
-import pyarrow as pa
-from dora import Node
-node = Node()
-for number, event in enumerate(node):
-    if event["type"] == "INPUT":
-        node.send_output("count", pa.array([number]))
-        print(number, flush=True)
-        if os.path.exists("fail"):
-            sys.exit(3)
-"""
-
-
 def recorded(bundle: Path) -> list[int]:
     """The numbers that node.py has sent, by the recording of a bundle."""
     with tarfile.open(bundle) as archive:
         names = archive.getnames()
         file = archive.extractfile("recording.mcap") if "recording.mcap" in names else None
-        messages = File(file.read()).messages if file else []
-    return [one.data[-8] + 256 * one.data[-7] for one in messages]
+        return counted(file.read()) if file else []
 
 
 @pytest.mark.parametrize("user", USERS)
 def test_a_failure_leaves_the_last_messages(user: str, flow: Path) -> None:
     """Before systemd 254 the memory of the recorder is gone when the unit has failed."""
     project = Project(flow.parent, is_new=False)
-    project.write("node.py", RECORDED)
+    project.write("node.py", COUNTING)
     node = "{id: talker, path: node.py, inputs: {t: dora/timer/millis/20}, outputs: [count]}"
     start(user, project.write("alone.yml", f"nodes: [{node}]\n"), *RECORD)
     file = Path(tempfile.mkdtemp(prefix="bundle-", dir="/var/tmp")) / "robot.tar"

@@ -56,6 +56,15 @@ def faults(browser: Browser) -> list[Any]:
     return found
 
 
+def look(browser: Browser, name: str) -> None:
+    """A picture of what everybody can read, in each scheme."""
+    for scheme in SCHEMES:
+        browser.prefer(scheme)
+        assert browser.js(CONTRAST) == [], scheme
+        assert faults(browser) == [], scheme
+        browser.picture(f"{name}-{scheme}", is_whole=True)
+
+
 def node(name: str) -> str:
     """The line of a node."""
     return f"#detail .nodes li[data-node={name}]"

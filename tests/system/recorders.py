@@ -7,6 +7,7 @@ from typing import Any
 from tests.lab.pace import pace
 from tests.system.cells import Cell, Project, wait_for
 from tests.system.test_signs import SAY
+from tests.unit.fakes.recorder.mcap import File
 
 SOURCE = """
 import time
@@ -125,3 +126,22 @@ def check_saved(cell: Cell, project: Project, stops: int) -> None:
         for node, sent in (("camera", camera[1]), ("arm", arm[1])):
             assert episode[node] == sent or is_overtaken(episode, node)
         assert max(camera[0], arm[0]) <= episode["told"]
+
+
+COUNTING = """
+import os, sys
+import pyarrow as pa
+from dora import Node
+node = Node()
+for number, event in enumerate(node):
+    if event["type"] == "INPUT":
+        node.send_output("count", pa.array([number]))
+        print(number, flush=True)
+        if os.path.exists("fail"):
+            sys.exit(3)
+"""
+
+
+def counted(data: bytes) -> list[int]:
+    """The numbers that node.py has sent, by a recording."""
+    return [one.data[-8] + 256 * one.data[-7] for one in File(data).messages]

@@ -16,9 +16,9 @@ import pytest
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, journalctl, run, sync_journal, wait_for
+from tests.system.recorders import COUNTING, counted
 from tests.system.test_record import has_more
 from tests.system.test_record import start as start_recorded
-from tests.unit.fakes.recorder.mcap import File
 
 # The units of notices are installed below /usr/local.
 pytestmark = [pytest.mark.lab, pytest.mark.usefixtures("units_for_all")]
@@ -250,32 +250,13 @@ def test_a_failure_that_nobody_has_seen(cell: Cell, project: Project, bundles: P
     assert [*bundles.glob("*.tar")] == [path]
 
 
-RECORDED = """
-import os, sys
-import pyarrow as pa
-from dora import Node
-node = Node()
-for number, event in enumerate(node):
-    if event["type"] == "INPUT":
-        node.send_output("count", pa.array([number]))
-        print(number, flush=True)
-        if os.path.exists("fail"):
-            sys.exit(3)
-"""
-
-
-def recorded(data: bytes) -> list[int]:
-    """The numbers that node.py has sent, by a recording."""
-    return [one.data[-8] + 256 * one.data[-7] for one in File(data).messages]
-
-
 @pytest.mark.warns(*CRASHES, "talker", "exited with", "failed: ", "is not written")
 @pytest.mark.parametrize("policy", ["no", "on-failure"])
 def test_a_failure_has_its_recording(
     cell: Cell, project: Project, bundles: Path, policy: str
 ) -> None:
     """Also when the unit has failed for good; the memory is free when the dataflow is reset."""
-    project.write("node.py", RECORDED)
+    project.write("node.py", COUNTING)
     node = "{id: talker, path: node.py, inputs: {t: dora/timer/millis/20}, outputs: [count]}"
     flow = project.write("dataflow.yml", f"nodes: [{node}]\n")
     settings = f"black_box: yes\nrecord: yes\nrestart_policy: {policy}\n"
@@ -289,7 +270,7 @@ def test_a_failure_has_its_recording(
     last = max(int(one) for one in cell.messages("talker"))
     found = texts(next(iter(bundles.glob("*.tar"))))
     assert found["errors.txt"] == b""
-    numbers = recorded(found["recording.mcap"])
+    numbers = counted(found["recording.mcap"])
     assert len(numbers) > 30
     assert max(numbers) <= last
     if policy == "no":

@@ -9,7 +9,7 @@ from tests.system import recorders
 from tests.system.cells import TICK, Cell, Project, journalctl, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
-from tests.system.pages import CONTRAST, SCHEMES, faults, node
+from tests.system.pages import faults, look, node
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
 
@@ -211,15 +211,6 @@ def test_disconnected_and_back(
     front.systemctl("start", SOCKET_UNIT)
     browser.click("#again")
     browser.wait_text("#link", "live")
-
-
-def look(browser: Browser, name: str) -> None:
-    """A picture of what everybody can read, in each scheme."""
-    for scheme in SCHEMES:
-        browser.prefer(scheme)
-        assert browser.js(CONTRAST) == [], scheme
-        assert faults(browser) == [], scheme
-        browser.picture(f"{name}-{scheme}", is_whole=True)
 
 
 def test_looks(browser: Browser, cell: Cell, project: Project) -> None:

@@ -17,7 +17,7 @@ from dora_systemd.scope import Scope
 from tests.system.cells import TICK, Cell, Project, journalctl, sync_journal, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
-from tests.system.pages import CONTRAST, SCHEMES, faults, node
+from tests.system.pages import look, node
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
 
@@ -137,15 +137,6 @@ def test_what_lives_have_used_before_the_page_was_opened(
     browser.resize(*PHONE, is_phone=True)
     browser.wait_js("document.documentElement.scrollWidth === 320")
     assert browser.failures() == []
-
-
-def look(browser: Browser, name: str) -> None:
-    """Pictures, on which everybody can read everything."""
-    for scheme in SCHEMES:
-        browser.prefer(scheme)
-        assert browser.js(CONTRAST) == [], scheme
-        assert faults(browser) == [], scheme
-        browser.picture(f"{name}-{scheme}", is_whole=True)
 
 
 def test_what_a_node_forges_is_bounded_text(

@@ -15,7 +15,8 @@ import pytest
 from tests.system.cells import TICK, Cell, Project, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
-from tests.system.test_gateway_past import PHONE, STORE, look
+from tests.system.pages import look
+from tests.system.test_gateway_past import PHONE, STORE
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
 
