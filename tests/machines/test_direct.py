@@ -7,7 +7,7 @@ import pytest
 from dora_systemd.errors import ExitCode
 from tests.machines.direct import ADDRESSES, DirectFlow
 from tests.machines.flows import NAME, THREE, TWO, flow_on
-from tests.machines.journals import BUSY, LOST, announced
+from tests.machines.journals import LOST, announced
 from tests.machines.wires import cable, there
 from tests.system.cells import run, wait_for
 
@@ -69,7 +69,7 @@ def test_nodes_meet_without_a_daemon_between(flow: DirectFlow) -> None:
     assert "python" in {theirs.get(one) for one in peers}, (peers, theirs)
 
 
-@pytest.mark.warns(*LOST, *BUSY)
+@pytest.mark.warns(*LOST)
 def test_a_cable_is_out(flow: DirectFlow) -> None:
     """Both sides end by the lease, as with ssh; it runs again, and no restart is counted."""
     flow.start("--restart-policy=on-failure", "--max-restarts=3", "--grace-duration=2s")

@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from tests.machines.flows import NAME, PLACE, Flow
-from tests.machines.journals import BUSY, LOST, quiet_journals
+from tests.machines.journals import LOST, quiet_journals
 from tests.machines.wires import power_cut, there
 from tests.system.cells import run, wait_for
 
@@ -36,7 +36,7 @@ def flow() -> Iterator[Flow]:
     for machine in PROCESSES:
         run("scp", "-q", "-r", PLACE, f"root@{machine}:/opt")
     run("scp", "-q", *(f"/root/.ssh/{key}" for key in KEYS), f"root@{HEAD}:/root/.ssh/")
-    with quiet_journals((*LOST, *BUSY)):
+    with quiet_journals(LOST):
         more = ("--restart-policy=on-failure", "--enable", "--grace-duration=2s")
         head("start", f"{PLACE}/dataflow.yml", "--name", NAME, *flow.flags(), *more)
         try:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.machines.flows import NAME, PLACE, Flow, flow_on
-from tests.machines.journals import AGAIN, BUSY, announced
+from tests.machines.journals import AGAIN, announced
 from tests.system.cells import DOUBLER, wait_for
 
 FAILS = DOUBLER + "        if event['value'][0].as_py() > 40:\n            raise SystemExit(3)\n"
@@ -39,7 +39,7 @@ class Essential(Flow):
 )
 def test_an_essential_node_there(flow: Essential, how: str, request: pytest.FixtureRequest) -> None:
     """The failure is the node's, not the loss of its machine."""
-    with flow_on(flow, [*announced(request), *BUSY, *AGAIN]):
+    with flow_on(flow, [*announced(request), *AGAIN]):
         flow.start("--grace-duration=2s")
         wait_for("the dataflow has failed", lambda: flow.cell.show("ActiveState") == "failed")
         why = flow.cell.doractl("why", NAME).stdout

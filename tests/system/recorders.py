@@ -19,8 +19,9 @@ for event in node:
         node.send_output("out", str(sent).encode())
 print("ends", time.monotonic_ns(), sent, flush=True)
 """
-# It needs some seconds to write what it has received: the last message of each source. The first
-# messages of a run can be lost, with dora as well, so it says so when it has received many.
+# It needs some seconds to write what it has received, the last message of each source, and goes on
+# while there is a file `hold`. The first messages of a run can be lost, with dora as well, so it
+# says so when it has received many.
 RECORDER = f"""
 import json, pathlib, time
 from dora import Node
@@ -38,8 +39,8 @@ for event in Node():
     elif event["type"] == "STOP":
         told = time.monotonic_ns()  # what waits in the queues follows
 part = pathlib.Path(os.environ["SAVED"], f"episode-{{run}}.part")
-begun = time.monotonic()
-while (left := begun + seconds - time.monotonic()) > 0:
+hold, end = part.with_name("hold"), time.monotonic() + seconds
+while time.monotonic() < end or hold.exists():
     say("STATUS=writing episode")
     if extend:
         say("EXTEND_TIMEOUT_USEC=1000000")
