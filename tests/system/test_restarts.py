@@ -68,6 +68,35 @@ def test_three_restarts_are_three(cell: Cell, project: Project) -> None:
     assert "node bad: exit code 3 after 3 restarts" in cell.show("StatusText")
 
 
+@pytest.mark.warns(*CRASHES, *KILLED)
+def test_a_restart_at_once_ends_as_well(cell: Cell, project: Project) -> None:
+    """Of a node by dora, and of the dataflow by systemd: the budget is what ends a crash loop."""
+    project.write("bad.py", CRASHING)
+    words = (*ON_FAILURE, "--restart-delay", "0")
+    flow = project.write("flow.yml", CRASH)
+    refused = cell.start(flow, *words, "--max-restarts", "infinity", check=False)
+    assert "cannot use restart_delay 0" in refused.stderr
+    cell.start(flow, *words, "--max-restarts", "3", "--max-restart-delay", "0", "--no-wait")
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
+    restarted, ready = times(cell, "node-restarted"), times(cell, "node-ready")[1:]
+    delays = [ready - crash for crash, ready in zip(restarted, ready, strict=True)]
+    assert (len(delays), min(delays) < SECOND // 2) == (3, True)
+
+    cell.start(project.three_nodes(), *words, "--max-restarts", "2")
+    assert cell.show("RestartUSec") == "0"
+
+    def come_back(restarts: str) -> None:
+        kill(cell, "runner")
+        wait_for("it is restarted", lambda: cell.show("NRestarts") == restarts)
+        wait_for("it is up", lambda: cell.show("ActiveState") == "active")
+
+    come_back("1")
+    come_back("2")
+    kill(cell, "runner")
+    wait_for("it is given up", lambda: cell.show("ActiveState") == "failed")
+    assert cell.show("ExecMainStatus") == "75"
+
+
 @pytest.mark.warns(*CRASHES)
 def test_what_the_dataflow_says_of_a_node_holds(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()

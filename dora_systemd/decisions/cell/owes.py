@@ -134,7 +134,7 @@ def policies_of(options: RunnerOptions) -> Mapping[str, RestartPolicy]:
     """The policies of single nodes. Raises DoraSystemdError."""
     given, owes = given_policies(options), owes_of(options)
     base = with_values(DEFAULT, given.pop("", {}))
-    return {node: with_values(base_of(base, owes, node), own) for node, own in given.items()}
+    return {node: with_values(base_of(base, owes, node), own, node) for node, own in given.items()}
 
 
 def is_probe(node: str) -> bool:

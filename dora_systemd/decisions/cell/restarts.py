@@ -15,19 +15,21 @@ from dora_systemd.values import (
     INFINITY,
     SECOND,
     format_duration,
+    format_number,
     parse_duration,
     quoted,
 )
 
 POLICIES = ("no", "on-failure", "always")
 
-MIN_DELAY = SECOND // 2
-"""µs. dora's default is 0, and restarted a node that cannot start 37 times a second."""
+DELAY = SECOND // 2
+"""µs, the default. dora's is 0, and restarted a node that cannot start 37 times a second. Less
+needs a budget that allows no more restarts in a window than this delay would."""
 
 HEAD_START = 2 * SECOND // 5
 """µs. systemd starts the runner this long before the delay of a restart is over, and the runner
 holds the nodes back: the sandbox, Python and dora are ready by then. What is left of
-the shortest delay is systemd's own default, for a runner that does not get that far."""
+DELAY is systemd's own default, for a runner that does not get that far."""
 
 MAX_RESTARTS = 1_000_000
 MOST_COUNTED = 64
@@ -45,7 +47,7 @@ class RestartPolicy(NamedTuple):
     max_restarts: int = 5  # in one window, or INFINITY
     window: int = 600 * SECOND
     # before the first restart; it doubles with each restart, up to max_delay
-    delay: int = MIN_DELAY
+    delay: int = DELAY
     max_delay: int = 30 * SECOND
 
     def dora_keys(self) -> dict[str, Any]:
@@ -131,18 +133,30 @@ def parse_count(text: str) -> int:
 
 
 def parse_delay(text: str) -> int:
-    """µs before a restart, at least MIN_DELAY. Raises DoraSystemdError (USAGE)."""
+    """µs before a restart. Raises DoraSystemdError (USAGE)."""
     delay = parse_duration(text)
-    if not MIN_DELAY <= delay < INFINITY:
+    if delay == INFINITY:
         message = f"cannot use {quoted(text)} as the delay of a restart"
-        hint = f"write {format_duration(MIN_DELAY)} or more: a crash loop uses up the CPU"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise DoraSystemdError(message, "write a time such as 500ms, or 0 for none", ExitCode.USAGE)
     return delay
 
 
-def with_values(base: RestartPolicy, values: Mapping[str, Any]) -> RestartPolicy:
-    """`base` with some fields changed; the maximum delay is at least the first delay."""
+def with_values(base: RestartPolicy, values: Mapping[str, Any], node: str = "") -> RestartPolicy:
+    """`base` with some fields changed; the maximum delay is at least the first delay.
+
+    node: whose policy it is, "" for the dataflow. Raises DoraSystemdError (USAGE) for a delay with
+    which a crash loop would not end.
+    """
     changed = base._replace(**values)
+    if changed.delay < DELAY and changed.max_restarts * DELAY > changed.window:
+        owner = f" of the node {quoted(node)}" if node else ""
+        message = (
+            f"cannot use restart_delay {format_duration(changed.delay)}{owner}: max_restarts"
+            f" {format_number(changed.max_restarts)} in {format_duration(changed.window)} never"
+            " ends a crash loop, which uses up the CPU"
+        )
+        hint = f"lower max_restarts, or use a restart_delay of {format_duration(DELAY)} or more"
+        raise DoraSystemdError(message, hint, ExitCode.USAGE)
     return changed._replace(max_delay=max(changed.max_delay, changed.delay))
 
 

@@ -48,7 +48,7 @@ RESTART_DELAY: Setting[int] = _policy_setting(
     "restart_delay",
     _DELAY,
     DEFAULT.delay,
-    "Delay before a restart; doubles with each restart.",
+    "Delay before a restart, 0 for none; doubles with each restart.",
 )
 MAX_RESTART_DELAY: Setting[int] = _policy_setting(
     "max_restart_delay", _DELAY, DEFAULT.max_delay, "Longest delay before a restart."

@@ -2,10 +2,10 @@
 
 RestartSteps= of systemd.service(5) counts all restarts since the unit was started, so two failures
 months apart would lengthen the delay. Therefore RestartSec= is the shortest delay without
-HEAD_START. The runner waits for the rest: before it does anything else if the delay is longer than
-the shortest, else when it has prepared all that comes before the nodes. The delay grows with each
-restart, until a quiet window resets it. systemd keeps the number of restarts, see lives() in
-dora_systemd.adapters.host.fd_store.
+HEAD_START, and 0 if HEAD_START is longer. The runner waits for the rest: before it does anything
+else if the delay is longer than the shortest, else when it has prepared all that comes before the
+nodes. The delay grows with each restart, until a quiet window resets it. systemd keeps the number
+of restarts, see lives() in dora_systemd.adapters.host.fd_store.
 
 StartLimitBurst= counts all starts, also those by hand, so it is only a backstop: the runner counts
 the automatic restarts, and refuses the one that would exceed the budget.
@@ -113,13 +113,14 @@ def held_until(options: RunnerOptions, is_user: bool, old: float | None = None) 
     process, None to read the time from the kernel.
     """
     now = time.clock_gettime(time.CLOCK_MONOTONIC)
-    if (seconds := HEAD_START / SECOND - (age() if old is None else old)) <= 0:
+    delay = restart_of(options).delay
+    if (seconds := min(delay, HEAD_START) / SECOND - (age() if old is None else old)) <= 0:
         return 0.0
     # systemd's timers are up to 250 ms late, and the delay begins before ExecStopPost=.
     ended = asked("ActiveExitTimestampMonotonic", options.name, is_user, 0)
-    since, delay = now - ended / SECOND, restart_of(options).delay / SECOND
+    since = now - ended / SECOND
     # After more than that it was another life, and the last one never became active.
-    known = delay - since if since < delay + _MOST_SECONDS else seconds
+    known = delay / SECOND - since if since < delay / SECOND + _MOST_SECONDS else seconds
     return now + max(min(seconds, known), 0)
 
 

@@ -23,7 +23,7 @@ def limits_from(text: str) -> NodeLimits:
 
 
 _TIME = st.integers(1, 10**12)
-_DELAY = st.integers(500_000, 10**12)
+_DELAY = st.integers(0, 10**12)
 RESTART_VALUES: dict[str, st.SearchStrategy[Any]] = {
     "restart_policy": st.sampled_from(["no", "on-failure", "always"]),
     "max_restarts": st.integers(1, 1_000_000) | st.just(INFINITY),

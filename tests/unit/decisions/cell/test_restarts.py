@@ -9,6 +9,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import policies_of
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
+    HEAD_START,
     Budget,
     RestartPolicy,
     budget_words,
@@ -103,8 +104,7 @@ def test_warnings() -> None:
         ("max_restarts", "many"),
         ("max_restarts", "٣"),
         ("max_restarts", "9" * 5000),
-        ("restart_delay", "0"),
-        ("restart_delay", "100ms"),
+        ("restart_delay", "-1"),
         ("restart_delay", "infinity"),
         ("restart_window", "0"),
         ("start_timeout", "0"),
@@ -116,6 +116,40 @@ def test_bad_values(name: str, text: str) -> None:
     assert caught.value.code is ExitCode.USAGE
     assert caught.value.message.startswith("cannot ")
     assert caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("given", "delay"),
+    [
+        ({"restart_delay": 0}, 0),
+        ({"restart_delay": "100ms"}, SECOND // 10),
+        ({"restart_delay": 0, "max_restarts": 1200}, 0),
+        ({"restart_delay": 0, "max_restarts": 9, "restart_window": "infinity"}, 0),
+        ({"restart_delay": "500ms", "max_restarts": "infinity"}, SECOND // 2),
+    ],
+)
+def test_a_restart_at_once(given: dict[str, object], delay: int) -> None:
+    policy = restart_of(runner(settings({}, given)))
+    assert (policy.delay, policy.delay_before(1)) == (delay, delay)
+    assert unit(policy._replace(policy="always"))["RestartSec"] == max(delay - HEAD_START, 0)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"restart_delay": 0, "max_restarts": 1201},
+        {"restart_delay": 0, "max_restarts": "infinity"},
+        {"restart_delay": 0, "restart_window": "2s"},
+        {"restart_delay": "499ms", "max_restarts": "infinity", "restart_window": "infinity"},
+    ],
+)
+@pytest.mark.parametrize("is_node", [False, True])
+def test_a_crash_loop_that_would_not_end(given: dict[str, object], is_node: bool) -> None:
+    options = runner(settings({}, {"nodes": {"camera": given}} if is_node else given))
+    with pytest.raises(DoraSystemdError, match=r"^cannot use restart_delay") as caught:
+        policies_of(options)
+    assert ("of the node 'camera'" in caught.value.message) == is_node
+    assert (caught.value.code, "500ms or more" in str(caught.value.hint)) == (ExitCode.USAGE, True)
 
 
 def node(raw: dict[str, Any], policy: RestartPolicy = DEFAULT, ident: str = "") -> dict[str, Any]:

@@ -139,6 +139,14 @@ def test_it_doubles_up_to_the_longest(unit: Unit) -> None:
     assert pauses == [0.1, 0.5, 1, 2, 4, 8, 16, 30, 30]
 
 
+@pytest.mark.parametrize(("delay", "pauses"), [(0, [0, 0, 0]), (SECOND // 5, [0, 0.2, 0.4])])
+def test_a_delay_shorter_than_the_head_start(unit: Unit, delay: int, pauses: list[float]) -> None:
+    """systemd waits for nothing, and the runner for what its own start has not taken."""
+    policy = POLICY._replace(delay=delay)
+    assert policy.unit_delay == 0
+    assert [round(unit.start(restarts, policy), 2) for restarts in range(3)] == pauses
+
+
 def spent(unit: Unit, ages: list[int], restarts: int, policy: RestartPolicy) -> str:
     """Why the restart after lives that began so many seconds ago is refused, or ""."""
     now = time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
