@@ -31,7 +31,6 @@ class Verb(NamedTuple):
 
     @property
     def command(self) -> click.Command:
-        """The click command."""
         name = f"dora_systemd.cli.verbs.{self.section}.{self.name}"
         found: click.Command = import_module(name).command
         _put_examples_last(found)

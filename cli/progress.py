@@ -57,7 +57,6 @@ class Progress(AbstractContextManager["Progress"]):
             self._show(step)
 
     def warn(self, text: str) -> None:
-        """Print a warning."""
         if not self._is_off:
             self._wipe()
             print_warnings([text])

@@ -77,7 +77,6 @@ class Whole:
         self.texts: dict[Host, bytearray] = {}
 
     def said(self, host: Host, data: bytes) -> DoraSystemdError | None:
-        """Keep it."""
         text = self.texts.setdefault(host, bytearray())
         text += data
         return too_much(host) if len(text) > MOST_BYTES else None
@@ -121,7 +120,6 @@ class JsonPrinter(Whole):
         self._found: dict[Host, list[dict[str, object]]] = {host: [] for host in hosts}
 
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
-        """Read it."""
         text = self.take(host).strip()
         if error or not text:
             return None
@@ -130,7 +128,6 @@ class JsonPrinter(Whole):
         return invalid(host) if found is None else None
 
     def finish(self) -> None:
-        """Print the list."""
         click.echo(format_json([one for some in self._found.values() for one in some], indent=2))
 
 
@@ -206,7 +203,6 @@ class TablePrinter(Whole, Generic[Row]):
         self._nothing = nothing
 
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
-        """Parse the rows of a host that has ended."""
         text = self.take(host).strip()
         if error:
             return None
@@ -221,7 +217,6 @@ class TablePrinter(Whole, Generic[Row]):
         return None
 
     def finish(self) -> None:
-        """Print the table."""
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
         text = self._shown(self._found, width, wants_colors(sys.stdout))
         if text:
@@ -266,7 +261,6 @@ class LogPrinter:
         self._last = dict.fromkeys(hosts, 0)
 
     def said(self, host: Host, data: bytes) -> DoraSystemdError | None:
-        """Take records."""
         records, now = self._records[host], time.monotonic()
         if self._form == "json":
             for value in records.objects(data):
@@ -308,7 +302,6 @@ class LogPrinter:
             sys.stdout.flush()
 
     def finish(self) -> None:
-        """Print the rest."""
         self.look(is_complete=True)
 
     def _line(self, host: Host, record: Mapping[str, bytes]) -> bytes:

@@ -111,7 +111,6 @@ class ServerSocket(Stream):
             self._writer.write_eof()
 
     async def send(self, message: str | bytes | AsyncIterable[str]) -> None:
-        """Send a message, whole or in parts; waits while the receiver is slow. Raises Gone."""
         try:
             async with self._turn:
                 if isinstance(message, str):

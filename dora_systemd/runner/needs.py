@@ -83,7 +83,6 @@ class Watch:
                 await self._event.wait()
 
     def close(self) -> None:
-        """Stop watching."""
         for source in self._sources:
             self._loop.remove_reader(source.fd)
             source.close()

@@ -37,11 +37,9 @@ class Sight:
     """The file system as an account sees it, here the caller. All paths are absolute."""
 
     def exists(self, path: str) -> bool:
-        """Whether something exists there."""
         return self._is(b"e", path)
 
     def is_directory(self, path: str) -> bool:
-        """Whether it is a directory."""
         return self._is(b"d", path)
 
     def is_program(self, path: str) -> bool:

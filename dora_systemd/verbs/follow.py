@@ -67,7 +67,6 @@ class UnitWatch(Follower):
         self._has_ended = False
 
     def wait(self, seconds: float) -> bool:
-        """Wait for a new record, at most `seconds`; whether there is one."""
         if not self.is_readable(seconds):
             return False
         while data := self.read(_CHUNK):
@@ -77,7 +76,6 @@ class UnitWatch(Follower):
         return True
 
     def take_end(self) -> bool:
-        """Whether systemd has logged an end of the unit since the last call."""
         ended, self._has_ended = self._has_ended, False
         if ended:
             self._rest = b""

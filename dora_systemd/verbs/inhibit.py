@@ -57,7 +57,6 @@ class Lock:
                 self.take()
 
     def release(self) -> None:
-        """Release the lock."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None

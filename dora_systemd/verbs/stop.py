@@ -46,8 +46,6 @@ class Ended:
 
 @dataclass(frozen=True)
 class _Stop:
-    """A stop in progress."""
-
     cell: Cell
     deadline: float  # seconds of the monotonic clock
     is_killed: bool

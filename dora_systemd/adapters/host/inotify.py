@@ -55,5 +55,4 @@ class Inotify:
                 pass
 
     def close(self) -> None:
-        """Stop watching."""
         os.close(self.fd)

@@ -153,7 +153,6 @@ class LinkChanges:
 
     @property
     def fd(self) -> int:
-        """The descriptor to poll."""
         return self._socket.fileno()
 
     def drain(self) -> None:
@@ -166,7 +165,6 @@ class LinkChanges:
                 self._socket.recv(1)
 
     def close(self) -> None:
-        """Stop watching."""
         self._socket.close()
 
 

@@ -94,7 +94,6 @@ class Source:
 
     @property
     def limit(self) -> RateLimit | None:
-        """The limit on its lines."""
         return self.limiter.limit if self.limiter else None
 
     def take_suppressed(self) -> int:
@@ -139,7 +138,6 @@ class LineBatch:
     passed: int = 0
 
     def entries(self) -> list[bytes]:
-        """Make the entries."""
         lines = self.pipe.lines(self.data) if self.lines is None else self.lines
         self.passed = len(lines)
         return list(map(self.encoder.entry, lines))

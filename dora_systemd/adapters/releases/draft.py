@@ -49,7 +49,6 @@ class Draft:
         return self._tree
 
     def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
-        """Write a file of the tree."""
         mode = 0o555 if is_executable else 0o444
         digest, size = hashlib.sha256(), 0
         # Not without a buffer: on a full disk write(2) may take a part, and raise nothing.
@@ -86,7 +85,6 @@ class Draft:
             return self.write(path, chunks, is_executable)
 
     def link(self, path: str, target: str) -> Stored:
-        """Create a symbolic link in the tree."""
         self._place(path).symlink_to(target)
         return Stored(target=target)
 

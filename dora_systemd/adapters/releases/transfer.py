@@ -65,7 +65,6 @@ class Spool:
         return Stored(target=target)
 
     def read(self, one: Stored) -> Iterator[bytes]:
-        """The content of a file."""
         at = self._places[one.digest]
         end = at + one.size
         while at < end and (chunk := os.pread(self._fd, min(_CHUNK, end - at), at)):

@@ -45,7 +45,6 @@ class Dataflow:
     raw: Mapping[str, object] = field(repr=False)  # the complete mapping
 
     def node(self, node_id: str) -> Node | None:
-        """The node with that id, or None."""
         return next((node for node in self.nodes if node.id == node_id), None)
 
 

@@ -115,7 +115,6 @@ def _names(life: Life, uuid: str) -> bool:
 
 
 def _life(life: Life, now: Now, use: Use) -> dict[str, Any]:
-    """A life that has ended."""
     verdict = examine([life], Facts(now_boot=now.boot))
     end = life.last(*END_EVENTS, *_UNIT_ENDS) or life.happenings[-1]
     memory = _peak(life, "held_peak")

@@ -41,7 +41,6 @@ class DoraLines:
         self._is_terminal = is_terminal
 
     def record(self, record: Record) -> bytes:
-        """The line of one record."""
         line = self._form(log_payload(record, self._uuid)).encode()
         return (shown_log(line) if self._is_terminal else line) + b"\n"
 

@@ -278,7 +278,6 @@ def project_build_properties(user: str, environment: Mapping[str, str]) -> dict[
 
 
 def _of_builds(environment: Mapping[str, str]) -> dict[str, Property]:
-    """The properties of every build."""
     return typed(
         Type="oneshot",
         WorkingDirectory="/",

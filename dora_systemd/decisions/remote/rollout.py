@@ -115,11 +115,9 @@ class Columns:
 
     @property
     def header(self) -> str:
-        """The first line."""
         return self._line(("HOST", "RESULT", "RELEASE", "BEFORE"))
 
     def row(self, one: Verdict) -> str:
-        """The line of a host."""
         return self._line([cell or _UNKNOWN for cell in one])
 
     def _line(self, cells: Sequence[str]) -> str:

@@ -17,7 +17,6 @@ class AfterMark:
         self.is_open = False
 
     def feed(self, data: bytes) -> bytes:
-        """Return the bytes after the mark."""
         if self.is_open:
             return data
         before, mark, after = (self.noise + data).partition(self._mark)

@@ -64,11 +64,9 @@ class Container(NamedTuple):
 
     @property
     def labels(self) -> dict[str, str]:
-        """The labels of its metric."""
         return {"program": self.program, "container": self.name or self.id[:_SHORT]}
 
     def values(self) -> dict[str, Any]:
-        """The container for JSON."""
         return {
             "program": self.program,
             "id": self.id or None,

@@ -39,7 +39,6 @@ class Rival(NamedTuple):
         return f"process {self.pid} ({what}, {self.cpu_percent:.0f}%)"
 
     def values(self) -> dict[str, Any]:
-        """The process for JSON."""
         values = self._asdict()
         return {**values, "cpu_percent": round(self.cpu_percent, 1), "node": self.node or None}
 
@@ -126,7 +125,6 @@ class Shared(NamedTuple):
         return f"as root: for n in {numbers}; do echo {self.elsewhere} > {path}; done"
 
     def values(self) -> dict[str, Any]:
-        """The interrupts for JSON."""
         return {
             "needs": self.needs,
             "names": list(self.names),

@@ -47,7 +47,6 @@ class Outcome:
 
     @property
     def error(self) -> DoraSystemdError | None:
-        """The problem as an error."""
         return DoraSystemdError(self.problem, self.hint, self.code) if self.problem else None
 
 

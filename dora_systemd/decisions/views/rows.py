@@ -19,7 +19,6 @@ class Holder(NamedTuple):
     why: str = ""  # the reason that the process has written, or ""
 
     def values(self) -> dict[str, Any]:
-        """The holder for JSON."""
         return {key: value or None for key, value in self._asdict().items()}
 
 
@@ -34,7 +33,6 @@ class Bundles(NamedTuple):
     reason: str = ""  # why that one was not written
 
     def values(self) -> dict[str, Any]:
-        """The bundles for JSON."""
         return {
             "kept": self.kept,
             "newest": self.newest or None,

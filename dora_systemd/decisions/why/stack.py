@@ -58,7 +58,6 @@ class Frame(NamedTuple):
     place: str  # the library and the offset in that file, or the file and the line
 
     def __str__(self) -> str:
-        """The frame as text."""
         return f"{self.function} ({self.place})"
 
 

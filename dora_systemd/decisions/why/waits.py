@@ -48,7 +48,6 @@ class CpuWait(NamedTuple):
         return f"{', '.join(parts)}{also}"
 
     def values(self) -> dict[str, Any]:
-        """The wait for JSON."""
         return {
             "node": self.node or None,
             "waited_percent": None if self.waited is None else round(self.waited, 1),

@@ -54,11 +54,9 @@ class Tasks:
             await self.raised(what, error)
 
     async def raised(self, what: str, error: Exception) -> None:
-        """Handle the exception of a task."""
         raise NotImplementedError
 
     def cancel(self) -> None:
-        """Cancel all tasks."""
         for task in self._tasks:
             task.cancel()
 

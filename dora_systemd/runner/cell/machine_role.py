@@ -95,7 +95,6 @@ class Alone:
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
-        """Return the Engine of this machine."""
         return Engine(dora, paths, environment, boot)
 
     def start_coordinator(self, dora: Engine) -> Child | None:

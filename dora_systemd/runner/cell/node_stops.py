@@ -49,7 +49,6 @@ class NodeStops:
             nodes.notify_sockets.on_extend = self.extend
 
     def perform(self, action: NodeAction) -> None:
-        """Carry out one action."""
         match action:
             case StopNode():
                 self._begin()

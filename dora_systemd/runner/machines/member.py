@@ -154,7 +154,6 @@ class Member(Shared):
         """Start nothing: only the head has a coordinator."""
 
     def cell(self, cell: Cell) -> Cell:
-        """Return the cell of a member."""
         return replace(cell, machine=self.options.machine)
 
     def dialogue(

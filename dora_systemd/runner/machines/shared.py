@@ -43,11 +43,9 @@ class Shared(Alone):
         return INFINITY
 
     def own(self, options: RunnerOptions) -> RunnerOptions:
-        """Return the options without those for nodes of other machines."""
         return own_options(options)
 
     def here(self, dataflow: Dataflow) -> Dataflow:
-        """Return the dataflow without the nodes of other machines."""
         return own_dataflow(self.options, dataflow)
 
 

@@ -35,7 +35,6 @@ class LogChanges:
         self._wake()
 
     def close(self) -> None:
-        """Stop watching."""
         if self._inotify is not None:
             self._loop.remove_reader(self._inotify.fd)
             self._inotify.close()

@@ -135,7 +135,6 @@ class NotifySockets:
         return self._unit / f"{NODE_PREFIX}{node}"
 
     def items(self) -> Iterator[tuple[str, NodeSocket]]:
-        """The nodes that have a socket."""
         return iter(list(self._by_node.items()))
 
     def table(self) -> dict[str, Sign]:
@@ -151,7 +150,6 @@ class NotifySockets:
         return self.clock.now
 
     def drain(self, node: str, entry: NodeSocket) -> None:
-        """Receive what waits in the socket."""
         for _ in range(_DRAIN):
             if not self._take(node, entry):
                 return

@@ -87,7 +87,6 @@ class ExtraNode:
             self.kill()
 
     def kill(self) -> None:
-        """Kill the node."""
         cgroup.kill_group(self.group)
 
 

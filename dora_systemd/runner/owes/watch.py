@@ -183,7 +183,6 @@ class Watch:
         return not self._run.pump.cell.nodes.get(node, NodeStatus()).machine
 
     def close(self) -> None:
-        """Close the file of times."""
         self._times.close()
 
     def _look(self, now: Look) -> None:
@@ -266,7 +265,6 @@ class SharedTimes:
             os.close(descriptor)
 
     def read(self) -> bytes:
-        """Read the content of the file."""
         return self._map[:]
 
     def close(self) -> None:

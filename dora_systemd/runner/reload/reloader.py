@@ -93,7 +93,6 @@ class Reloader:
 
     @property
     def run(self) -> Run | None:
-        """The current run, if there is one."""
         return self._run
 
     def end(self) -> None:
@@ -370,7 +369,6 @@ class Reloader:
         return {"done": []}
 
     def close(self) -> None:
-        """Stop watching."""
         self._watcher.watch(None)
 
 

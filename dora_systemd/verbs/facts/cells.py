@@ -47,12 +47,10 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """The name of the dataflow."""
         return self.unit.removeprefix(UNIT_PREFIX).removesuffix(UNIT_SUFFIX)
 
     @property
     def unit(self) -> str:
-        """The name of the unit."""
         return self.state.unit
 
     @property

@@ -27,7 +27,6 @@ class Held(NamedTuple):
 
     @property
     def word(self) -> str:
-        """The status of the dataflow."""
         return WAITING if self.needs else STARTING
 
     @property

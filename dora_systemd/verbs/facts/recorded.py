@@ -54,8 +54,6 @@ def _is_loaded(scope: Scope, selectors: Sequence[str]) -> bool:
 
 
 class _Recorded(NamedTuple):
-    """A dataflow in the journal."""
-
     name: str
     uuid: str = ""
 

@@ -69,7 +69,6 @@ class MemberRequest:
 
     @property
     def unit(self) -> str:
-        """The unit of the part."""
         return unit_name(self.start.name or "")
 
 

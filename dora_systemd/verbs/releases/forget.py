@@ -30,7 +30,6 @@ class Kept(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """The name of its unit."""
         return unit_name(self.name)
 
 

@@ -142,7 +142,6 @@ class SharedLog:
         return self._head.fileno()
 
     def print_new(self) -> None:
-        """Write some of the received lines."""
         self._head.print_new()
         self._look()
 
@@ -153,7 +152,6 @@ class SharedLog:
         return bool(lines)
 
     def finish(self) -> None:
-        """Write the remaining lines of a unit that has ended."""
         self._head.finish()
         begun = last = time.monotonic()
         while self.others and (now := time.monotonic()) < min(

@@ -208,7 +208,6 @@ class Talks:
         return [one.host for one in self._live]
 
     def say(self, host: Host, chunks: Iterable[bytes]) -> None:
-        """Send chunks to a host."""
         for one in self._live:
             if one.host == host:
                 one.say(chunks)

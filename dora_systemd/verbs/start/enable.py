@@ -189,7 +189,6 @@ def link_paths(boot: BootUnit, options: RunnerOptions | None) -> list[tuple[Path
 
 
 def _links_of(options: RunnerOptions | None) -> list[str]:
-    """The units of all links of a dataflow."""
     if options is None or not options.placed:
         return []
     from dora_systemd.decisions.machines.link_unit import link_units_of

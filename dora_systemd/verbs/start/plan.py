@@ -56,7 +56,6 @@ class Plan:
 
     @property
     def unit(self) -> str:
-        """The name of the unit."""
         return unit_name(self.options.name)
 
 

@@ -45,7 +45,6 @@ class Asked:
 
     @property
     def unit(self) -> str:
-        """The name of the unit."""
         return unit_name(self.name)
 
     def request(self, wanted: "StartRequest") -> "StartRequest":
