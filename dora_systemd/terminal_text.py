@@ -54,11 +54,7 @@ def wrapped(line: str, width: int, indent: int) -> list[str]:
     import textwrap
 
     return textwrap.wrap(
-        line,
-        width,
-        subsequent_indent=" " * indent,
-        break_on_hyphens=False,
-        break_long_words=False,
+        line, width, subsequent_indent=" " * indent, break_on_hyphens=False, break_long_words=False
     )
 
 

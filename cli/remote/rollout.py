@@ -203,11 +203,7 @@ class Rollout:
         self._print(host, verdict, outcome, problem)
 
     def _print(
-        self,
-        host: Host,
-        verdict: Verdict,
-        outcome: dict[str, Any],
-        problem: dict[str, Any] | None,
+        self, host: Host, verdict: Verdict, outcome: dict[str, Any], problem: dict[str, Any] | None
     ) -> None:
         if self._is_quiet:
             return

@@ -6,14 +6,7 @@ from pathlib import Path
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.decisions.gateway.request import (
-    PLAIN,
-    Answer,
-    Get,
-    Request,
-    Talk,
-    text_answer,
-)
+from dora_systemd.decisions.gateway.request import PLAIN, Answer, Get, Request, Talk, text_answer
 from dora_systemd.decisions.views.prometheus import CONTENT_TYPE, format_metrics
 from dora_systemd.gateway.control.serve import serve_control
 from dora_systemd.gateway.live.page import talk

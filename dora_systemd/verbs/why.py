@@ -212,11 +212,7 @@ def _shutdowns(journal: JournalReader) -> list[int]:
 
 
 def _last_words(
-    journal: JournalReader,
-    scope: Scope,
-    subject: Subject,
-    verdict: Verdict,
-    stack: Sequence[Frame],
+    journal: JournalReader, scope: Scope, subject: Subject, verdict: Verdict, stack: Sequence[Frame]
 ) -> tuple[Word, ...]:
     """The last lines of the node that failed first, up to its end; else those of all nodes.
 

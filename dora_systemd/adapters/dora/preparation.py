@@ -8,10 +8,7 @@ from typing import Any
 
 from dora_systemd.adapters.dora.command import refusal_reason, run_dora
 from dora_systemd.adapters.host import files
-from dora_systemd.decisions.cell.launch import (
-    LaunchPlan,
-    launch_descriptor,
-)
+from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import (
     BuildSession,

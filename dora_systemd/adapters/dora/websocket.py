@@ -43,10 +43,7 @@ class Stream:
     """Messages over one connection, for the client as for the server."""
 
     def __init__(
-        self,
-        protocol: Protocol,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
+        self, protocol: Protocol, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
         self._protocol = protocol
         self._reader = reader

@@ -23,9 +23,7 @@ _NOTICE = "to turn off this notice."
 
 @contextmanager
 def open_journalctl(
-    arguments: Sequence[str],
-    want_colors: bool = False,
-    outlives_interrupt: bool = False,
+    arguments: Sequence[str], want_colors: bool = False, outlives_interrupt: bool = False
 ) -> "Iterator[subprocess.Popen[bytes]]":
     """A running journalctl, which the block ends.
 

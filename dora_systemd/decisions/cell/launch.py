@@ -19,12 +19,7 @@ from dora_systemd.decisions.cell.owes import base_of, owes_of, policies_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS, restart_of
 from dora_systemd.decisions.cell.uv import Read, find_lock, uv_project
 from dora_systemd.decisions.descriptor.dataflow import BuildSession, Dataflow, expanded
-from dora_systemd.decisions.descriptor.nodes import (
-    Node,
-    NodeKind,
-    operator_file,
-    split_arguments,
-)
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind, operator_file, split_arguments
 from dora_systemd.decisions.watchdog.watchdogs import (
     ALL_NODES,
     OFF,

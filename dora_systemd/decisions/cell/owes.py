@@ -8,12 +8,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.restarts import (
-    DEFAULT,
-    RestartPolicy,
-    given_policies,
-    with_values,
-)
+from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, given_policies, with_values
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean

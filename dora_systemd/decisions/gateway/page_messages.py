@@ -54,13 +54,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dora_systemd.decisions.cell.environment import with_changes
-from dora_systemd.decisions.cell.limits import (
-    BY_KEY,
-    LIMITS,
-    Limit,
-    NodeLimits,
-    limits_of,
-)
+from dora_systemd.decisions.cell.limits import BY_KEY, LIMITS, Limit, NodeLimits, limits_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.logs.records import Record, record_text

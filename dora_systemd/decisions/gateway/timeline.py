@@ -16,13 +16,7 @@ from dora_systemd.decisions.logs.journal_events import (
     START_ASKED,
 )
 from dora_systemd.decisions.logs.query import UNIT_RESOURCES
-from dora_systemd.decisions.why.lives import (
-    Happening,
-    Life,
-    find_lives,
-    parse_number,
-    plain_text,
-)
+from dora_systemd.decisions.why.lives import Happening, Life, find_lives, parse_number, plain_text
 from dora_systemd.decisions.why.postmortem import examine
 from dora_systemd.decisions.why.verdict import Facts
 

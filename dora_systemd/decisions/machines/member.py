@@ -237,10 +237,7 @@ def on_head(options: RunnerOptions) -> RunnerOptions:
 
 
 def member_of(
-    machine: Machine,
-    options: RunnerOptions,
-    settings: Settings,
-    variables: Mapping[str, str],
+    machine: Machine, options: RunnerOptions, settings: Settings, variables: Mapping[str, str]
 ) -> Member:
     """Return the Member for a machine. Raises DoraSystemdError (BAD_INPUT) for too long settings.
 
@@ -258,10 +255,7 @@ def member_of(
 
 
 def _words(
-    machine: Machine,
-    options: RunnerOptions,
-    settings: Settings,
-    variables: Mapping[str, str],
+    machine: Machine, options: RunnerOptions, settings: Settings, variables: Mapping[str, str]
 ) -> Iterator[str]:
     here = PurePath(options.dataflow)
     yield from (VERB, str(PurePath(machine.directory or here.parent, here.name)))

@@ -41,11 +41,7 @@ class End(Protocol):
 
 
 def verdict_of(
-    host: Host,
-    verb: str,
-    end: End,
-    error: DoraSystemdError | None,
-    outcome: Mapping[str, Any],
+    host: Host, verb: str, end: End, error: DoraSystemdError | None, outcome: Mapping[str, Any]
 ) -> Verdict:
     """The verdict about a host. error: why it was not reached, or is lost. outcome: its object."""
     known = as_mapping(outcome.get("details"))

@@ -178,11 +178,7 @@ def parse_cpu_list(text: str) -> int:
 
 
 def share_interrupts(
-    node: str,
-    needs: str,
-    cpus: int,
-    online: int,
-    found: Iterable[tuple[Interrupt, int]],
+    node: str, needs: str, cpus: int, online: int, found: Iterable[tuple[Interrupt, int]]
 ) -> Iterator[Shared]:
     """Yield what a node shares with a device that the node needs.
 

@@ -5,11 +5,7 @@ from collections.abc import Sequence
 from operator import add
 from typing import Any
 
-from dora_systemd.decisions.cell.limits import (
-    BY_KEY,
-    check_nodes,
-    limits_of,
-)
+from dora_systemd.decisions.cell.limits import BY_KEY, check_nodes, limits_of
 from dora_systemd.decisions.cell.line_rates import RateLimit, format_rate, parse_rate
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import is_negative, parse_nice

@@ -217,10 +217,7 @@ def cgroup_properties() -> dict[str, Property]:
 
 def directory_properties(options: RunnerOptions) -> dict[str, Property]:
     """The cell's own directory below /run, removed when the unit ends, see systemd.exec(5)."""
-    return typed(
-        RuntimeDirectory=(f"{RUNTIME_NAME}/{options.name}",),
-        RuntimeDirectoryMode=0o700,
-    )
+    return typed(RuntimeDirectory=(f"{RUNTIME_NAME}/{options.name}",), RuntimeDirectoryMode=0o700)
 
 
 def notice_properties(options: RunnerOptions) -> dict[str, Property]:

@@ -32,10 +32,7 @@ class EarlyDaemon:
         more: Sequence[str] = (),
     ) -> None:
         self._dora, self._paths, self._unit = options.dora, paths, unit
-        self._environment = {
-            **environment,
-            **daemon_variables(options, paths, unit, environment),
-        }
+        self._environment = {**environment, **daemon_variables(options, paths, unit, environment)}
         self._port, self._token, self._more = 0, token, more
         self._work = beside(self._start_daemon)
 

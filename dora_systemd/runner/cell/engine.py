@@ -148,10 +148,7 @@ class Engine:
         return str(protocol.result_of(reply, "DataflowStartTriggered")["uuid"])
 
     async def read_events(
-        self,
-        run: str,
-        on_start: Callable[[], None],
-        on_record: OnRecord,
+        self, run: str, on_start: Callable[[], None], on_record: OnRecord
     ) -> None:
         """Subscribe to a run, call on_start, and pass its events to on_record until the end."""
         with closing(await self.connect()) as connection:

@@ -26,15 +26,7 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
 from dora_systemd.decisions.life.runner_exit import RunnerExit
-from dora_systemd.decisions.life.states import (
-    Action,
-    Cell,
-    Deadline,
-    Do,
-    NodeAction,
-    Record,
-    State,
-)
+from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, NodeAction, Record, State
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status, is_up
 from dora_systemd.decisions.logs.journal_events import END_EVENTS, NODE_END_EVENTS

@@ -165,10 +165,7 @@ def _asked(manager: Manager, state: UnitState) -> Cell | None:
 
 def _read_options(manager: Manager, unit: str) -> "tuple[RunnerOptions | None, str]":
     # Imported late: the list of what runs has all it needs from systemd's own list.
-    from dora_systemd.decisions.cell.options import (
-        known_options_from_command,
-        options_from_command,
-    )
+    from dora_systemd.decisions.cell.options import known_options_from_command, options_from_command
 
     commands: Any = manager.read(unit, ["ExecStart"])["ExecStart"]
     problem = ""

@@ -75,11 +75,7 @@ class Reading(NamedTuple):
 
 
 def read_dataflow(
-    manager: Manager,
-    scope: Scope,
-    cell: Cell,
-    slice_path: Path | None = None,
-    is_row: bool = False,
+    manager: Manager, scope: Scope, cell: Cell, slice_path: Path | None = None, is_row: bool = False
 ) -> Reading:
     """Read one dataflow.
 

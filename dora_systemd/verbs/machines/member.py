@@ -189,8 +189,7 @@ def _member_plan(plan: Plan, part: Part) -> Plan:
     have given. Longer, it could keep this machine from a shutdown.
     """
     options = plan.options.with_value("restart_policy", "no")._replace(
-        start_timeout=INFINITY,
-        grace=min(part.grace, plan.options.grace),
+        start_timeout=INFINITY, grace=min(part.grace, plan.options.grace)
     )
     return replace(plan, options=options)
 

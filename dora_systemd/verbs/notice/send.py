@@ -26,12 +26,7 @@ from dora_systemd.decisions.notice.happened import (
     summary,
     variables,
 )
-from dora_systemd.decisions.notice.unit import (
-    JSON,
-    SECONDS,
-    NoticeUnit,
-    notice_properties,
-)
+from dora_systemd.decisions.notice.unit import JSON, SECONDS, NoticeUnit, notice_properties
 from dora_systemd.decisions.unit.systemd_versions import transient_commands
 from dora_systemd.decisions.why.report import format_report, report_object
 from dora_systemd.errors import DoraSystemdError

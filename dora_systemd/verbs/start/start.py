@@ -51,11 +51,7 @@ class Claim:
 
 
 def claim(
-    manager: Manager,
-    scope: Scope,
-    request: StartRequest,
-    command: str,
-    want_boot: bool = False,
+    manager: Manager, scope: Scope, request: StartRequest, command: str, want_boot: bool = False
 ) -> Claim:
     """Check the request, prepare its unit and record the request, see restart_ended.py.
 
