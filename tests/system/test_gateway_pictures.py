@@ -73,6 +73,8 @@ def test_the_last_picture_of_a_camera(
     browser.wait_js(f"({PIXEL}) === '200,30,40,255'")
     browser.wait_text(BROKEN, "cannot be shown")
     assert "count" not in browser.text(".pictures")
+    browser.wait_text(".graph", "camera")
+    assert "dora-systemd" not in browser.text(".graph"), "the recorder is none of its nodes"
     look(browser, "pictures")
     browser.resize(*PHONE, is_phone=True)
     browser.wait_js("document.documentElement.scrollWidth === 320")

@@ -7,16 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.extra import PROBE, is_extra
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, given_policies, with_values
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
-
-PROBE = "dora-systemd-probe"
-"""The beginning of dora's id of the node that receives the outputs; its cgroup is node-PROBE. See
-decisions/owes/probe.py."""
 
 RESTART, WARN, FAIL = "restart", "warn", "fail"
 THEN = (RESTART, WARN, FAIL)
@@ -132,11 +129,6 @@ def policies_of(options: RunnerOptions) -> Mapping[str, RestartPolicy]:
     return {node: with_values(base_of(base, owes, node), own, node) for node, own in given.items()}
 
 
-def is_probe(node: str) -> bool:
-    """Whether dora's node id is that of a probe."""
-    return node.startswith(PROBE)
-
-
 _OTHER = "write then: warn or then: fail"
 _NEVER_RESTARTED = {
     NodeKind.OPERATOR: "dora does not restart nodes made of operators",
@@ -161,7 +153,7 @@ def check_owes(
             hint = f"{_OTHER}, or another restart_policy"
             hint = _OTHER if node.kind in _NEVER_RESTARTED else hint
             raise _impossible(f"cannot restart the silent node {quoted(one.node)}: {reason}", hint)
-    for probe in filter(is_probe, by_id):
+    for probe in (one for one in by_id if is_extra(one, PROBE)):
         message = f"cannot watch outputs: the node {quoted(probe)} has a name that doractl needs"
         raise _impossible(message, "give that node another id")
 

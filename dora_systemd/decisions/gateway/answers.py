@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from dora_systemd.decisions.cell.exits import ExitKind, find_exit
+from dora_systemd.decisions.cell.extra import without_extra
 from dora_systemd.decisions.logs.records import (
     DORA_LEVELS,
     Record,
@@ -120,12 +121,13 @@ def bare_descriptor(nodes: Iterable[str]) -> dict[str, Any]:
 def restored_descriptor(
     running: Mapping[str, Any], written: Sequence[Mapping[str, Any]], keys: Sequence[str]
 ) -> dict[str, Any]:
-    """The descriptor of a run, with each node's `keys` as its file has them.
+    """The descriptor of a run without added nodes, and each node's `keys` as its file has them.
 
     For nodes from a module's file, the program is the one that our launcher gets: an absolute path.
     """
     by_id = {node.get("id"): node for node in written}
-    nodes = [_restored(node, by_id.get(node.get("id"), {}), keys) for node in running["nodes"]]
+    own = without_extra(running["nodes"])
+    nodes = [_restored(node, by_id.get(node.get("id"), {}), keys) for node in own]
     return {**running, "nodes": nodes}
 
 

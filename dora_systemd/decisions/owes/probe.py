@@ -18,7 +18,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from dora_systemd.decisions.cell.owes import PROBE, Owed
+from dora_systemd.decisions.cell.extra import PROBE, extra_id
+from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, downstream_of
 from dora_systemd.values import SECOND
 
@@ -38,14 +39,14 @@ def extra_definition(
     inputs: Mapping[str, Mapping[str, Any]],
     variables: Mapping[str, str],
 ) -> dict[str, Any]:
-    """The node for dora's descriptor. name: of its group, and the beginning of its id.
+    """The node for dora's descriptor. name: PROBE or RECORDER.
 
     number: of earlier nodes of that name in this run. command: the program. launcher: what executes
     the program.
     """
     interpreter, script = launcher
     return {
-        "id": f"{name}.{number}",
+        "id": extra_id(name, number),
         "path": interpreter,
         "args": shlex.join([script, name, "/", "keep", *command]),
         "inputs": {key: dict(one) for key, one in inputs.items()},

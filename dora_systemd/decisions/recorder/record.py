@@ -6,6 +6,7 @@ The setting is in decisions/settings/record.py.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.extra import RECORDER, is_extra
 from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
@@ -22,8 +23,6 @@ from dora_systemd.values import (
     quoted,
 )
 
-RECORDER = "dora-systemd-recorder"
-"""The beginning of dora's id of the recorder; its cgroup is node-RECORDER."""
 KEYS = ("last", "memory", "outputs")
 MEGABYTE = 1024 * 1024
 ROOM = 160 * MEGABYTE
@@ -107,11 +106,6 @@ def format_record(record: Record | None) -> str:
     return f"last={last},memory={format_size(record.memory)}{names}"
 
 
-def is_recorder(node: str) -> bool:
-    """Whether dora's node id is that of a recorder."""
-    return node.startswith(RECORDER)
-
-
 def check_record(record: Record | None, options: RunnerOptions, nodes: Sequence[Node]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for an output that no node has. nodes: expanded."""
     if record is None:
@@ -127,7 +121,7 @@ def check_record(record: Record | None, options: RunnerOptions, nodes: Sequence[
         if machine := placed_on(options.placed, name.partition("/")[0]):
             hint = "only outputs of nodes on the machine of the dataflow's unit can be recorded"
             raise _impossible(f"cannot record {quoted(name)}: it is on machine {machine}", hint)
-    for one in filter(is_recorder, by_id):
+    for one in (one for one in by_id if is_extra(one, RECORDER)):
         message = f"cannot record outputs: the node {quoted(one)} has a name that doractl needs"
         raise _impossible(message, "give that node another id")
 

@@ -14,6 +14,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.host.notify import extend_timeout
+from dora_systemd.decisions.cell.extra import without_extra
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import HOT_RELOAD, PageMessage, graph_values
 from dora_systemd.errors import DoraSystemdError
@@ -213,12 +214,13 @@ def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:
 
 
 def _running_descriptor(scope: Scope, cell: Cell) -> object:
-    """dora's copy, or None if no run has one."""
+    """dora's copy without the nodes that the runner has added, or None if no run has one."""
     run = read_status(scope, cell).run if cell.has_begun else ""
     # The dataflow may be ending at this moment.
     with suppress(DoraSystemdError, KeyError, TypeError):
         if run:
             reply = ask_coordinator(scope, cell, {"Info": {"dataflow_uuid": run}})
             if isinstance(reply.result, dict) and not reply.error:
-                return reply.result["DataflowInfo"]["descriptor"]
+                running = reply.result["DataflowInfo"]["descriptor"]
+                return {**running, "nodes": without_extra(running["nodes"])}
     return None

@@ -12,8 +12,8 @@ from typing import Any
 from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
+from dora_systemd.decisions.cell.extra import PROBE, RECORDER, is_extra
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owes import is_probe
 from dora_systemd.decisions.cell.rights import essential_nodes, rights_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import life_events, protocol
@@ -21,7 +21,6 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.node_table import held, lacking, with_process
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
-from dora_systemd.decisions.recorder.record import is_recorder
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.clock import Gaps, Ticks
 from dora_systemd.runner.cell.engine import Engine
@@ -181,7 +180,9 @@ class Dialogue(Tasks):
     def _is_own(self, node: str) -> bool:
         """Whether this runner has added the node, which the dataflow does not contain."""
         has = self._options.has
-        return (has("owes") and is_probe(node)) or (has("record") and is_recorder(node))
+        return (has("owes") and is_extra(node, PROBE)) or (
+            has("record") and is_extra(node, RECORDER)
+        )
 
     def _hear(self, record: protocol.LogRecord) -> None:
         self._release_exits(record)

@@ -12,8 +12,8 @@ from pathlib import Path
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_load, read_oom
 from dora_systemd.adapters.host.process_table import PROC, beginning
+from dora_systemd.decisions.cell.extra import EXTRA
 from dora_systemd.decisions.cell.log_backlog import Marks
-from dora_systemd.decisions.cell.owes import PROBE
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_owner, largest
 from dora_systemd.decisions.resources.pressure import Alarms, Load, Most, is_quiet, look
@@ -114,8 +114,8 @@ class Resources:
 
         samples: those before `now`.
         """
-        nodes = cgroup.node_groups(self._unit)
-        nodes.pop(PROBE, None)  # it is no node of the dataflow
+        found = cgroup.node_groups(self._unit)
+        nodes = {node: path for node, path in found.items() if node not in EXTRA}
         groups = {WHOLE_CELL: self._unit, **nodes}
         loads = {key: _load(path, key, samples, now) for key, path in groups.items()}
         self._most |= {key: self._most.get(key, Most()).after(one) for key, one in loads.items()}

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.cell.extra import extra_id
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life.states import State
@@ -30,7 +31,7 @@ _TRIES = 2
 class ExtraNode:
     """Adds one node, and the next one after its end.
 
-    name: the beginning of their ids. longest: µs between two nodes at most.
+    name: PROBE or RECORDER. longest: µs between two nodes at most.
     """
 
     def __init__(self, run: Run, dora: Engine, name: str, longest: int = LATE) -> None:
@@ -77,7 +78,7 @@ class ExtraNode:
 
     async def remove(self, grace: int) -> None:
         """Have dora end the node, and kill it if dora does not. grace: µs."""
-        ident = f"{self._name}.{self.count}"
+        ident = extra_id(self._name, self.count)
         params = protocol.node_params("RemoveNode", self._run.pump.cell.run, ident, grace)
         try:
             reply = await self._engine.ask_apart(params, _ANSWER_SECONDS)

@@ -15,8 +15,9 @@ from typing import Any
 
 from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
 from dora_systemd.adapters.dora.probe import probe_python
+from dora_systemd.decisions.cell.extra import PROBE
 from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
-from dora_systemd.decisions.cell.owes import PROBE, RESTART, WARN, owes_of
+from dora_systemd.decisions.cell.owes import RESTART, WARN, owes_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life

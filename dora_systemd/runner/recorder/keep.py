@@ -21,12 +21,12 @@ from dora_systemd.adapters.dora.probe import recorder_python, total_memory
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.adapters.runner_socket.client import Request
 from dora_systemd.adapters.runner_socket.listener import Answer
+from dora_systemd.decisions.cell.extra import RECORDER
 from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.owes.probe import extra_definition
 from dora_systemd.decisions.recorder.record import (
-    RECORDER,
     ROOM,
     Record,
     check_memory,

@@ -15,6 +15,7 @@ from websockets.uri import parse_uri
 
 from dora_systemd.adapters.dora.control import Connection
 from dora_systemd.adapters.dora.websocket import WebSocket
+from dora_systemd.decisions.cell.extra import RECORDER, extra_id
 from dora_systemd.decisions.gateway.answers import (
     bare_descriptor,
     dataflow_list,
@@ -253,9 +254,11 @@ def test_levels(level: str, wanted: list[int]) -> None:
 
 def test_descriptors() -> None:
     assert bare_descriptor(["a"]) == {"nodes": [{"id": "a", "path": ""}]}
-    running = {"debug": 1, "nodes": [{"id": "a", "path": "/bin/sh", "args": "x", "inputs": 1}]}
+    node = {"id": "a", "path": "/bin/sh", "args": "x", "inputs": 1}
+    running: dict[str, Any] = {"debug": 1, "nodes": [node]}
     written = [{"id": "a", "path": "a.py"}]
-    assert restored_descriptor(running, written, ("path", "args")) == {
+    added = {**running, "nodes": [node, {"id": extra_id(RECORDER, 1)}]}
+    assert restored_descriptor(added, written, ("path", "args")) == {
         "debug": 1,
         "nodes": [{"id": "a", "path": "a.py", "inputs": 1}],
     }

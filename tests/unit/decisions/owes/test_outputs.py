@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
+from dora_systemd.decisions.cell.extra import PROBE, is_extra
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.owes import (
     SHORTEST,
@@ -15,7 +16,6 @@ from dora_systemd.decisions.cell.owes import (
     Owed,
     check_owes,
     format_owed,
-    is_probe,
     owes_of,
     parse_owed,
 )
@@ -158,7 +158,7 @@ def test_a_silent_node_has_a_policy(then: str, policy: str | None) -> None:
 def test_the_probe_is_a_node_of_its_own() -> None:
     inputs = [(3, CAMERA.place)]
     node = probe_definition(7, ["python", "probe.py"], ("/usr/bin/perl", "/l.pl"), inputs)
-    assert is_probe(node["id"])
+    assert is_extra(node["id"], PROBE)
     assert node["inputs"] == {"3": {"source": "camera/image", "queue_size": 1}}
     assert node["args"] == "/l.pl dora-systemd-probe / keep python probe.py"
 

@@ -12,11 +12,11 @@ import pytest
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.exits import Exit, exit_of
+from dora_systemd.decisions.cell.extra import RECORDER
 from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import Do, State
-from dora_systemd.decisions.recorder.record import RECORDER
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.clock import Ticks

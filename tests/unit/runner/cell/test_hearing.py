@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
-from dora_systemd.decisions.cell.owes import PROBE, Owed
+from dora_systemd.decisions.cell.extra import PROBE, extra_id
+from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.rights import NodeRights
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora.protocol import LogRecord
@@ -203,7 +204,7 @@ def test_a_line_that_means_nothing(tmp_path: Path) -> None:
 
 
 OWES = (Owed("a", "image", 2_000_000),)
-PROBE_NODE = f"{PROBE}a"
+PROBE_NODE = extra_id(PROBE, 1)
 
 
 def test_a_node_that_the_runner_has_added_is_none_of_the_dataflow(tmp_path: Path) -> None:

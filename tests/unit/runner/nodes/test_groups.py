@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.cgroup.strain import read_load, read_oom
+from dora_systemd.decisions.cell.extra import EXTRA
 from dora_systemd.decisions.cell.log_backlog import Marks
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.resources.containers import CLIENTS
@@ -82,6 +83,14 @@ def test_the_most_that_a_group_has_used(unit: Path) -> None:
     most = {"held_peak": str(52 * MIB), "mapped_peak": str(75 * MIB), "cpu_peak": "80"}
     assert resources.most("a") == most
     assert resources.most("b") == {}, "no memory.stat, and no CPU time"
+
+
+@pytest.mark.parametrize("name", EXTRA)
+def test_an_added_node_is_none_of_the_dataflow(unit: Path, name: str) -> None:
+    resources, group = Resources(unit), (unit / "node-a").rename(unit / f"node-{name}")
+    (group / "memory.stat").write_text(f"anon {20 * MIB}\n")
+    resources.look((), CpuSample(0, {name: 0}))
+    assert resources.most(name) == {}
 
 
 def test_groups_that_do_nothing_and_have_no_limit(unit: Path) -> None:

@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.decisions.cell.owes import PROBE, Owed
+from dora_systemd.decisions.cell.extra import PROBE, extra_id
+from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
@@ -177,7 +178,7 @@ def test_a_warning_and_its_end(tmp_path: Path) -> None:
         "node-speaks-again",
     ]
     assert bench.pump.cell.nodes["a"].silent == ""
-    assert bench.asked == [("AddNode", f"{PROBE}.1")]
+    assert bench.asked == [("AddNode", extra_id(PROBE, 1))]
 
 
 def test_failure_ends_the_dataflow(tmp_path: Path) -> None:
@@ -205,7 +206,7 @@ def test_another_probe_after_one_that_ended(tmp_path: Path) -> None:
         await bench.work(5)
 
     bench = lived(tmp_path, work)
-    assert [one["id"] for one in bench.added()] == [f"{PROBE}.1", f"{PROBE}.2"]
+    assert [one["id"] for one in bench.added()] == [extra_id(PROBE, 1), extra_id(PROBE, 2)]
     assert not bench.named("outputs-unwatched")
 
 

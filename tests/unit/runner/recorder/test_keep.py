@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.host import fd_store
+from dora_systemd.decisions.cell.extra import RECORDER, extra_id
 from dora_systemd.decisions.cell.options import SettingText
-from dora_systemd.decisions.recorder.record import RECORDER, ROOM, Record
+from dora_systemd.decisions.recorder.record import ROOM, Record
 from dora_systemd.decisions.recorder.ring import ALIGN, parse_header
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.recorder.keep import (
@@ -90,7 +91,7 @@ def lived(root: Path, seconds: float, does_end: bool = False, python: str = "/p"
 def test_a_node_of_its_own_within_limits(tmp_path: Path) -> None:
     bench = lived(tmp_path, 100)
     (node,) = bench.added()
-    assert node["id"] == f"{RECORDER}.1"
+    assert node["id"] == extra_id(RECORDER, 1)
     assert node["inputs"] == {
         "0": {"source": "a/image", "queue_size": 4},
         "1": {"source": "b/x", "queue_size": 4},
