@@ -13,7 +13,7 @@ from pathlib import Path
 from benchmarks.cost import cpu_seconds, private_mb
 from benchmarks.flows import STAMPS, STREAM_RECEIVER, STREAM_SENDER, clear_stamps, make_home
 from benchmarks.rounds import OURS, Figure, keep, shown
-from dora_systemd.decisions.cell.owes import PROBE
+from dora_systemd.decisions.cell.extra import PROBE
 from tests.system.cells import Cell, Project, run, wait_for
 
 SECONDS = 10.0

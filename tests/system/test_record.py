@@ -13,6 +13,7 @@ import pytest
 from dora_systemd.decisions.recorder.mcap import write_recording
 from dora_systemd.decisions.recorder.reading import Reading, Recorded
 from dora_systemd.trust.rings import find_ring
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, wait_for
 from tests.unit.fakes.recorder.mcap import File
 
@@ -184,6 +185,7 @@ MESSAGES = int(os.environ.get("MESSAGES", "200"))
 """An hour has 720,000 of them: `tests/lab/lab run --env MESSAGES=720000 -- pytest ...`."""
 
 
+@pytest.mark.timeout(bound(300) + MESSAGES / 10)
 @pytest.mark.warns(
     LARGE, "Discarding", "grace", "exited with error", "sink", "NextEvent", "on drop"
 )
