@@ -10,7 +10,7 @@ import click
 
 from dora_systemd import __version__
 from dora_systemd.cli.parameters import current_scope, scope_options, without_all
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 
 TITLES = {
     "run": "Start and stop",
@@ -118,7 +118,7 @@ class VerbGroup(click.Group):
         args = [name, *without_all(ctx, words)]
         if name.startswith("-") or self.get_command(ctx, name):
             return super().resolve_command(ctx, args)
-        raise DoraSystemdError(f"unknown command {name!r}", _meant_verb(name), ExitCode.USAGE)
+        raise usage_error(f"unknown command {name!r}", _meant_verb(name))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs and their summaries without importing them."""
@@ -199,7 +199,7 @@ def _usage_error(error: click.ClickException) -> DoraSystemdError:
     words = f"{words[:1].lower()}{words[1:]}".replace("no such command", "unknown command", 1)
     if isinstance(error, click.NoSuchOption):
         words = f"unknown option {error.option_name}"
-    return DoraSystemdError(words, hint, ExitCode.USAGE)
+    return usage_error(words, hint)
 
 
 def _known_names(error: click.MissingParameter) -> str:

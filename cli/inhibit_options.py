@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import click
 
 from dora_systemd.cli.parameters import tell
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.verbs.facts.locks import IfInhibited
 
 C = TypeVar("C", bound=Callable[..., Any])
@@ -26,8 +26,7 @@ def inhibit_options(command: C, or_else: str = "") -> C:
 def if_inhibited(force: bool, wait: bool) -> IfInhibited:
     """Return the choice of the two options. Raises DoraSystemdError (USAGE) for both."""
     if force and wait:
-        message = "cannot use --force with --wait"
-        raise DoraSystemdError(message, "give one of them", ExitCode.USAGE)
+        raise usage_error("cannot use --force with --wait", "give one of them")
     if force:
         return IfInhibited.FORCE
     return IfInhibited.WAIT if wait else IfInhibited.REFUSE

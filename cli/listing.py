@@ -11,7 +11,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_own
 from dora_systemd.decisions.views.dataflows import format_dataflows, is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.terminal_text import cut, one_line
@@ -108,10 +108,10 @@ def print_dataflows(request: ListRequest) -> int:
 
 def _check(request: ListRequest) -> None:
     if request.is_quiet and request.output == "json":
-        raise DoraSystemdError("cannot use --quiet with JSON", "omit one of them", ExitCode.USAGE)
+        raise usage_error("cannot use --quiet with JSON", "omit one of them")
     if request.selector is not None and request.is_filtered and not request.is_pattern:
         hint = "--last, --status, --name and --sort-by are for the list of all dataflows"
-        raise DoraSystemdError("cannot filter a single dataflow", hint, ExitCode.USAGE)
+        raise usage_error("cannot filter a single dataflow", hint)
 
 
 def _rows(bus: Manager, scope: Scope, request: ListRequest) -> list[DataflowRow]:

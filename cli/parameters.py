@@ -7,7 +7,7 @@ import click
 
 from dora_systemd.cli.edge import print_error, print_warning
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.values import parse_duration
 
@@ -183,7 +183,7 @@ def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) ->
     """Raise DoraSystemdError (USAGE) unless a command line has either names or --all."""
     if bool(selectors) == want_all:
         hint = f"doractl {verb} NAME, or doractl {verb} --all"
-        raise DoraSystemdError(f"cannot {verb}: give names or --all", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot {verb}: give names or --all", hint)
 
 
 def print_outcomes(outcomes: Iterable[Outcome]) -> ExitCode:

@@ -52,6 +52,16 @@ class DoraSystemdError(Exception):
         self.code = code
 
 
+def usage_error(message: str, hint: str = "") -> DoraSystemdError:
+    """The error for a command line, or a value in it, that is not valid."""
+    return DoraSystemdError(message, hint, ExitCode.USAGE)
+
+
+def bad_input(message: str, hint: str = "") -> DoraSystemdError:
+    """The error for a file that is not valid, or that cannot be used."""
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
 class WrongKey(DoraSystemdError):
     """A settings file has a wrong key or value. source: its path. place: the keys down to there.
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import PurePath
 from typing import Protocol
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.values import quoted
 
 UNIT_PREFIX = "dora-"
@@ -88,7 +88,7 @@ def parse_name(text: str) -> str:
     elif text in RESERVED_NAMES:
         hint = f"dora-{text}.service is part of dora-systemd: choose another name"
     if hint:
-        raise DoraSystemdError(f"cannot use {quoted(text)} as a name", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot use {quoted(text)} as a name", hint)
     return text
 
 
@@ -115,7 +115,7 @@ def name_from_path(path: str) -> str:
         return parse_name(name)
     except DoraSystemdError as error:
         message = f"cannot make a name from {quoted(path)}"
-        raise DoraSystemdError(message, "give one with --name", ExitCode.USAGE) from error
+        raise usage_error(message, "give one with --name") from error
 
 
 def unit_name(name: str) -> str:
@@ -185,7 +185,7 @@ def parse_uuid(text: str) -> str:
     if is_uuid(text.lower()):
         return text.lower()
     hint = "a UUID is 32 hexadecimal digits as 8-4-4-4-12"
-    raise DoraSystemdError(f"cannot read {quoted(text)} as a UUID", hint, ExitCode.USAGE)
+    raise usage_error(f"cannot read {quoted(text)} as a UUID", hint)
 
 
 def is_uuid_prefix(text: str, at_least: int = MIN_PREFIX) -> bool:
@@ -204,9 +204,8 @@ def check_known(problem: str, named: Iterable[str], nodes: Iterable[str]) -> Non
     known = list(nodes)
     for node in named:
         if node not in known:
-            message = f"{problem} the node {quoted(node)}: no such node"
             hint = did_you_mean(node, known) or f"nodes: {', '.join(known)}"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(f"{problem} the node {quoted(node)}: no such node", hint)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

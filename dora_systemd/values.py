@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 
 INFINITY = 2**64 - 1
 """"infinity" on D-Bus, "max" in cgroup files: UINT64_MAX, for sizes, durations and CPU shares."""
@@ -180,7 +180,7 @@ def _scaled(whole: str, fraction: str | None, factor: int) -> int | None:
 
 
 def _refusal(what: str, text: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot read {quoted(text)} as a {what}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot read {quoted(text)} as a {what}", hint)
 
 
 _FIRST_CPU = INFINITY.bit_length()
@@ -205,7 +205,7 @@ def parse_cpus(text: str) -> int:
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         if not first <= last < MOST_CPUS:
             hint = "write numbers and ranges such as 2-3 or 0,2; or infinity for all"
-            raise DoraSystemdError(f"cannot use {quoted(text)} as cpus", hint, ExitCode.USAGE)
+            raise usage_error(f"cannot use {quoted(text)} as cpus", hint)
         bits |= (1 << (last + 1)) - (1 << first)
     return bits << _FIRST_CPU
 

@@ -12,7 +12,7 @@ from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.remote.run import pass_through, run_on_all
 from dora_systemd.decisions.cell.machines import HEAD, Placed, machine_of
 from dora_systemd.decisions.remote.hosts import Host
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import did_you_mean
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.values import quoted
@@ -49,9 +49,8 @@ def find_machines(scope: Scope, context: click.Context) -> tuple[list[Host], Pla
     given = context.params
     wanted, selectors = given["machine"], given["selectors"]
     if wanted and len(selectors) != 1:
-        hint = "doractl logs NAME --machine MACHINE"
         message = "cannot use --machine without one dataflow"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(message, "doractl logs NAME --machine MACHINE")
     if wanted == HEAD or is_pattern(selectors[0]):
         return None
     bus = Bus(scope, for_reading=True)
@@ -60,7 +59,7 @@ def find_machines(scope: Scope, context: click.Context) -> tuple[list[Host], Pla
     if cell is None or not known:
         if wanted:
             message = f"cannot find machine {quoted(wanted)}: {selectors[0]} runs on this one only"
-            raise DoraSystemdError(message, "doractl list NAME shows machines", ExitCode.USAGE)
+            raise usage_error(message, "doractl list NAME shows machines")
         return None
     if scope != scope_of(None):
         # Only the user of that scope has its keys for ssh.
@@ -105,7 +104,7 @@ def _host_of(name: str, known: dict[str, Host | None], dataflow: str) -> Host:
     if name not in known:
         hint = did_you_mean(name, known) or f"valid values: {', '.join((HEAD, *known))}"
         message = f"cannot find machine {quoted(name)}: {dataflow} does not run there"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(message, hint)
     host = known[name]
     if host is None:
         message = f"cannot reach machine {name}: its link is not loaded"

@@ -7,7 +7,7 @@ import click
 
 from dora_systemd.decisions.remote.command_line import without_flag
 from dora_systemd.decisions.remote.hosts import Way
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.verbs.remote.talk import ANSWER_SECONDS, SHORT_SECONDS
 
 _REFUSED = {
@@ -134,8 +134,8 @@ def check_hosts(plan: Plan, count: int) -> None:
     """Raise DoraSystemdError (USAGE) for a verb that makes no sense on that many hosts."""
     hint = _REFUSED.get(plan.verb, "")
     if hint:
-        raise DoraSystemdError(f"cannot use {plan.verb} with -H", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot use {plan.verb} with -H", hint)
     hint = _ONE_HOST.get(plan.verb, "") if count > 1 else ""
     hint = "leave --attach out" if count > 1 and plan.options.get("want_logs") else hint
     if hint:
-        raise DoraSystemdError(f"cannot {plan.verb} on several hosts", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot {plan.verb} on several hosts", hint)

@@ -20,7 +20,7 @@ from dora_systemd.decisions.remote.merge import TIME, Merge, Records, time_of
 from dora_systemd.decisions.remote.ssh_failures import invalid, too_much
 from dora_systemd.decisions.remote.stream import Lines, objects_of, read_object, with_host
 from dora_systemd.decisions.views.objects import error_object, format_json
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.terminal_text import one_line, shown_log
 
 MOST_BYTES = 64 << 20
@@ -233,8 +233,7 @@ def words_of_logs(plan: Plan) -> list[str]:
     """Return the command for each host. Raises DoraSystemdError (USAGE)."""
     form = str(plan.options["output"])
     if form not in FORMS:
-        hint = f"-o {' or -o '.join(FORMS)}"
-        raise DoraSystemdError(f"cannot merge -o {form} of several hosts", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot merge -o {form} of several hosts", f"-o {' or -o '.join(FORMS)}")
     return with_output([*plan.words], FORMS[form])
 
 

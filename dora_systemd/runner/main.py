@@ -35,7 +35,7 @@ from dora_systemd.decisions.life.refusal import refusal_exit
 from dora_systemd.decisions.life.runner_exit import RunnerExit
 from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.logs.lines import Origin
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.names import settings_path
 from dora_systemd.paths import CellPaths, own_directory, request_file
 from dora_systemd.runner.cell.begin import (
@@ -386,7 +386,7 @@ def run(argv: list[str], begun: Begun | None) -> int:
         directory = own_directory(os.environ)
         if not directory:
             hint = "it is started by systemd: use `doractl start`"
-            raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
+            raise usage_error("cannot run without RUNTIME_DIRECTORY", hint)
         return run_loop(run_cell(options, CellPaths(Path(directory)), begun))
     except DoraSystemdError as error:
         say(f"{error.message}\n{error.hint}".strip())

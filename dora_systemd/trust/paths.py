@@ -25,7 +25,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.values import shown
 
 _MAX_LINKS = 40
@@ -266,4 +266,4 @@ def _parts(path: str) -> list[str]:
 
 def refusal(path: str | Path, reason: str, hint: str) -> DoraSystemdError:
     """The error for a file that is not read."""
-    return DoraSystemdError(f"cannot read {shown(str(path))}: {reason}", hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot read {shown(str(path))}: {reason}", hint)

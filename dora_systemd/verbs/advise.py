@@ -25,7 +25,7 @@ from dora_systemd.decisions.logs.journal_events import END_EVENTS
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.settings.resolve import with_settings
 from dora_systemd.decisions.why.lives import Life, find_lives, parse_happening
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import release_of, settings_path
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
@@ -163,9 +163,8 @@ def apply(report: AdviceReport, project: Project | None) -> AdviceReport:
     Raises DoraSystemdError; then nothing is changed.
     """
     if project is None:
-        message = f"cannot change the settings of {report.name}: it runs a release"
         hint = "change the settings file of its project, and deploy that"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(f"cannot change the settings of {report.name}: it runs a release", hint)
     if not report.advices:
         return report
     beside, path = project.files.beside, project.path
@@ -187,9 +186,8 @@ def _changed(text: str, path: Path, advice: Advice) -> str:
     place = _place(document, advice.place)
     after = with_value(text, place, advice.value)
     if after is None or _put(document, place, advice.value) != _read_back(after, path, place):
-        what = f"write {': '.join((*advice.place, advice.value))} there"
         message = f"cannot change {shown(str(path))} by itself"
-        raise DoraSystemdError(message, what, ExitCode.BAD_INPUT)
+        raise bad_input(message, f"write {': '.join((*advice.place, advice.value))} there")
     return after
 
 
@@ -241,6 +239,5 @@ def _check(report: AdviceReport, project: Project, text: str) -> None:
     for one in left:
         if one.place in places:
             who = f"node {one.node}" if one.node else report.name
-            message = f"cannot change {one.setting} of {who} in {shown(str(path))}"
             hint = "a flag of its start takes precedence"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(f"cannot change {one.setting} of {who} in {shown(str(path))}", hint)

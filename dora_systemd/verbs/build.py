@@ -40,7 +40,7 @@ from dora_systemd.decisions.settings.table import (
     VENV,
     WORKING_DIRECTORY,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.trust.programs import own_account, spawn
 from dora_systemd.trust.sight import sight_of
@@ -128,8 +128,7 @@ def find_project(scope: Scope, request: StartRequest) -> Project:
     """Read and check what is to be built, and by whom. Raises DoraSystemdError."""
     is_root = os.geteuid() == 0
     if is_root and scope.is_user:
-        hint = "leave --user out: the owner of the files builds"
-        raise DoraSystemdError("cannot build as root", hint, ExitCode.USAGE)
+        raise usage_error("cannot build as root", "leave --user out: the owner of the files builds")
     scope, files = scope_of(is_user=not is_root), read_files(request)
     settings = settings_of(scope, files, request)
     directory = working_directory(files, settings)

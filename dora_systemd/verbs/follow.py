@@ -28,7 +28,7 @@ from dora_systemd.decisions.logs.query import (
     journal_timestamp,
     scope_matches,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.logs import Follower, find_span
@@ -86,12 +86,11 @@ def check_until_end(query: LogQuery) -> None:
     """Raise DoraSystemdError (USAGE) for a query that --until-end cannot have."""
     if not query.name or query.others:
         which = "several" if query.others else "all"
-        hint = "say which dataflow: doractl logs NAME --until-end"
         message = f"cannot wait for the end of {which} dataflows"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(message, "say which dataflow: doractl logs NAME --until-end")
     if query.is_reverse:
         hint = "leave --reverse or --until-end out"
-        raise DoraSystemdError("cannot follow with the newest lines first", hint, ExitCode.USAGE)
+        raise usage_error("cannot follow with the newest lines first", hint)
 
 
 def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) -> None:

@@ -12,7 +12,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.decisions.views.inhibitors import Inhibited, format_holders, format_reason
 from dora_systemd.decisions.views.rows import Holder
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.trust.locks import find_lock, open_lock, place_of, take_lock, write_reason
 from dora_systemd.verbs.facts.cells import Cell, read_cells
@@ -93,7 +93,7 @@ def _run(lock: Lock, command: Sequence[str]) -> int:
         child = subprocess.Popen(command)
     except OSError as error:
         message = f"cannot run {command[0]}: {error.strerror}"
-        raise DoraSystemdError(message, "give a program after --", ExitCode.USAGE) from error
+        raise usage_error(message, "give a program after --") from error
     with _signals_for(child):
         _wait(lock, child)
     status = child.wait()

@@ -15,7 +15,7 @@ from dora_systemd.decisions.cell.status import PROTOCOL
 from dora_systemd.decisions.dora.command import coordinator_variables, parse_node_command
 from dora_systemd.decisions.dora.protocol import Coordinator, Params, Reply
 from dora_systemd.decisions.life.stop_budget import answer_timeout
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import did_you_mean
 from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
@@ -51,10 +51,9 @@ def reached_coordinator(scope: Scope, manager: Manager, cell: Cell) -> Coordinat
     coordinator = read_coordinator(scope, cell)
     uid, is_private = _unit_facts(manager, cell)
     if is_private:
-        raise DoraSystemdError(
+        raise usage_error(
             f"cannot reach the coordinator of {cell.name} by a port: its network is private",
             f"doractl {scope.flag} dora {cell.name} -- ..., or doractl env for the gateway",
-            ExitCode.USAGE,
         )
     require_listener(coordinator.port, uid)
     return coordinator
@@ -195,10 +194,9 @@ def socket_of(scope: Scope, cell: Cell) -> Path:
     protocol = read_status(scope, cell).protocol
     if protocol != PROTOCOL:
         reason = f"it has protocol {protocol}, and this doractl has protocol {PROTOCOL}"
-        raise DoraSystemdError(
+        raise usage_error(
             f"cannot send a request to the runner of {cell.name}: {reason}",
             f"doractl restart {cell.name} starts the installed version",
-            ExitCode.USAGE,
         )
     return CellPaths(scope.cell_directory(cell.name)).socket
 

@@ -21,7 +21,7 @@ from dora_systemd.decisions.cell.options import SettingText, changed, format_set
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.recorder.record import format_record, parse_record
 from dora_systemd.decisions.unit.properties import format_unit
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.values import format_bool
@@ -139,5 +139,4 @@ def _refuse_release(cell: Cell) -> None:
     """Raise DoraSystemdError (USAGE) for a deployed dataflow, whose files do not change."""
     if release := release_of(cell.options.dataflow):
         message = f"cannot reload {cell.name}: the files of its release {release} do not change"
-        hint = f"doractl deploy --name {cell.name} brings a new version"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(message, f"doractl deploy --name {cell.name} brings a new version")

@@ -11,7 +11,7 @@ from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer, Stage
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.runner_socket.client import ask_refusal
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.containers import find_outside, with_left
@@ -81,7 +81,7 @@ def _is_of_other_version(cell: Cell) -> bool:
 def _other_version(cell: Cell) -> DoraSystemdError:
     message = f"cannot restart {cell.name}: another version of dora-systemd has started it"
     hint = f"{cell.name} keeps running; doractl list {cell.name} says how to start this version"
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    return bad_input(message, hint)
 
 
 def require_startable(scope: Scope, cell: Cell, ask: Ask = ask_refusal) -> None:

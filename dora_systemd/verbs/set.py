@@ -29,7 +29,7 @@ from dora_systemd.decisions.settings.limits import LOG_RATE_LIMIT
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings, runner_texts
 from dora_systemd.decisions.settings.table import CHANGEABLE
 from dora_systemd.decisions.unit.properties import settings_properties
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.enabled import enabled_units
@@ -57,9 +57,8 @@ def set_limits(
     settings = resolve_settings(flags, {}, (), CHANGEABLE)
     properties, nodes, rates = settings_properties(settings), _limits(settings), _rates(settings)
     if not properties and not nodes and not rates:
-        hint = "see doractl set --help"
         message = f"cannot change the limits of {cell.name}: none is given"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(message, "see doractl set --help")
     refuse_parts([cell], "set")
     _refuse_placed(cell, [*(one.node for one in nodes), *rates])
     if not scope.is_user and os.geteuid() != 0:
@@ -118,9 +117,8 @@ def _refuse_placed(cell: Cell, nodes: Iterable[str]) -> None:
     placed = dict(cell.options.placed)
     for node in nodes:
         if machine := placed.get(node):
-            message = f"cannot limit the node {node}: it runs on machine {machine}"
             hint = f"stop {cell.name}, and start it with another limit"
-            raise DoraSystemdError(message, hint, ExitCode.USAGE)
+            raise usage_error(f"cannot limit the node {node}: it runs on machine {machine}", hint)
 
 
 def _placed_warnings(cell: Cell, rates: line_rates.RateLimits) -> list[str]:

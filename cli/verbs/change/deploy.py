@@ -25,7 +25,7 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.progress import open_progress, quiet_option
 from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import ExitCode, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, compare, deploy
 from dora_systemd.verbs.releases.receive import compare_sent, receive
@@ -110,7 +110,7 @@ def command(
     if dry_run:
         return _print_changes(bus, scope, start, not no_build, from_stdin, is_quiet)
     if not build_timeout:
-        raise DoraSystemdError("cannot build in no time", "give a --build-timeout", ExitCode.USAGE)
+        raise usage_error("cannot build in no time", "give a --build-timeout")
     how, build_timeout = if_inhibited(force, wait), 0 if no_build else build_timeout
     request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout, allow_waiting)
     done = _deploy(bus, scope, request, from_stdin, is_quiet)

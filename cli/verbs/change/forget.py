@@ -7,7 +7,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import ExitCode, usage_error
 from dora_systemd.verbs.releases.forget import Kept, find_kept, forget, remove_releases
 
 
@@ -48,8 +48,7 @@ def _removed(kept: Kept, release: str) -> Outcome:
 def _agrees(kept: Kept) -> bool:
     """Ask at the terminal for a confirmation. Raises DoraSystemdError (USAGE) without terminal."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        message = f"cannot forget {kept.name}: nobody can be asked"
-        raise DoraSystemdError(message, "use --force", ExitCode.USAGE)
+        raise usage_error(f"cannot forget {kept.name}: nobody can be asked", "use --force")
     return click.confirm(f"Remove {_count(kept)} of {kept.name} for good?", err=True)
 
 

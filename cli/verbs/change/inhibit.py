@@ -20,7 +20,7 @@ from dora_systemd.decisions.views.inhibitors import (
     parse_reason,
 )
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import ExitCode, usage_error
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit import hold, inhibited_dataflows, take_inhibiting
 
@@ -46,7 +46,7 @@ def command(selector: str | None, arguments: tuple[str, ...], why: str | None) -
         return _list(why)
     if why is None:
         hint = f"doractl inhibit {selector} --why TEXT; doractl inhibit lists all locks"
-        raise DoraSystemdError("cannot inhibit without a reason", hint, ExitCode.USAGE)
+        raise usage_error("cannot inhibit without a reason", hint)
     reason, scope = parse_reason(why), current_scope()
     cell = Selector(selector).find_present(Bus(scope), scope)
     lock = take_inhibiting(scope, cell, reason)
@@ -59,8 +59,7 @@ def command(selector: str | None, arguments: tuple[str, ...], why: str | None) -
 
 def _list(why: str | None) -> int:
     if why is not None:
-        hint = "doractl inhibit NAME --why TEXT"
-        raise DoraSystemdError("cannot inhibit: give a dataflow", hint, ExitCode.USAGE)
+        raise usage_error("cannot inhibit: give a dataflow", "doractl inhibit NAME --why TEXT")
     scope = current_scope()
     found = inhibited_dataflows(Bus(scope, for_reading=True), scope)
     if wants_json():

@@ -6,7 +6,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.bundles.table import bundle_object, format_bundles
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.verbs.bundles.listing import (
     find_name,
     kept_names,
@@ -47,7 +47,7 @@ def command(selector: str | None, bundle: tuple[str, ...], output: str) -> None:
 def _remove(selector: str | None, bundles: tuple[str, ...]) -> None:
     if selector is None:
         hint = "doractl bundles NAME --remove BUNDLE"
-        raise DoraSystemdError("--remove needs the name of a dataflow", hint, ExitCode.USAGE)
+        raise usage_error("--remove needs the name of a dataflow", hint)
     scope = current_scope()
     name = find_name(Bus(scope, for_reading=True), scope, selector)
     for one in remove_bundles(scope, name, bundles):

@@ -17,7 +17,7 @@ from dora_systemd.cli.terminal import is_dumb, wants_colors
 from dora_systemd.decisions.logs.query import ALL_LINES, OUTPUTS, LogQuery, is_boot, parse_level
 from dora_systemd.decisions.logs.records import parse_filter
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import ExitCode, usage_error
 from dora_systemd.names import LINK_PREFIX
 from dora_systemd.scope import Scope
 from dora_systemd.trust.programs import check_program
@@ -213,9 +213,8 @@ def last_count(values: Sequence[str]) -> str:
     """The number of lines, "" for none. Raises DoraSystemdError (USAGE)."""
     for value in values:
         if value != ALL_LINES and not _COUNT.fullmatch(value):
-            hint = "a number such as 100, or all"
             message = f"cannot use {quoted(value)} as a number of lines"
-            raise DoraSystemdError(message, hint, ExitCode.USAGE)
+            raise usage_error(message, "a number such as 100, or all")
     return values[-1] if values else ""
 
 

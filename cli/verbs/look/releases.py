@@ -7,7 +7,7 @@ from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.views.objects import switch_object
 from dora_systemd.decisions.views.releases import format_history, format_releases, release_object
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases.listing import deployed_names, read_history, read_releases
 from dora_systemd.verbs.releases.rollback import deployed_name
@@ -49,7 +49,7 @@ def command(selector: str | None, want_history: bool, output: str) -> None:
 def _print_history(bus: Bus, scope: Scope, selector: str | None, output: str) -> None:
     if selector is None:
         hint = "doractl releases NAME --history"
-        raise DoraSystemdError("--history needs the name of a dataflow", hint, ExitCode.USAGE)
+        raise usage_error("--history needs the name of a dataflow", hint)
     name = deployed_name(bus, scope, selector)
     history = read_history(bus, scope, name)
     if output == "json":

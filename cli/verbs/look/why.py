@@ -10,7 +10,7 @@ from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.why.report import format_report, report_object
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import ExitCode, usage_error
 from dora_systemd.verbs.why import explain_now, newest_failure, subject_row
 
 
@@ -52,8 +52,7 @@ def _print_bundle(selector: str | None, path: Path, output: str) -> int:
     from dora_systemd.verbs.bundles.listing import parse_why, read_report, shown_readme
 
     if selector is not None:
-        hint = "doractl why --bundle FILE"
-        raise DoraSystemdError("cannot use both a SELECTOR and --bundle", hint, ExitCode.USAGE)
+        raise usage_error("cannot use both a SELECTOR and --bundle", "doractl why --bundle FILE")
     readme, why = read_report(path)
     if output == "json":
         click.echo(json.dumps(parse_why(why, path), indent=2))

@@ -6,7 +6,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.decisions.dora.command import SHELLS, format_exports, format_unsets
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.verbs.gateway import read_variables
 
 
@@ -37,7 +37,7 @@ def command(selector: str | None, shell: str, want_unset: bool) -> None:
     """
     if want_unset and selector is not None:
         hint = "leave SELECTOR out: --unset is for all variables"
-        raise DoraSystemdError("cannot unset for one dataflow", hint, ExitCode.USAGE)
+        raise usage_error("cannot unset for one dataflow", hint)
     if want_unset:
         click.echo(format_unsets(shell))
         return

@@ -17,7 +17,7 @@ from dora_systemd.decisions.machines.link_command import RESTRICTED
 from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.decisions.settings.resolve import SET
 from dora_systemd.decisions.settings.table import SETTINGS
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.verbs.machines.member import (
     Head,
@@ -142,7 +142,7 @@ def command(
     """
     if sys.stdin.isatty():
         hint = "doractl start on the head starts the members"
-        raise DoraSystemdError("cannot run a member: no head is here", hint, ExitCode.USAGE)
+        raise usage_error("cannot run a member: no head is here", hint)
     start = StartRequest(
         dataflow,
         parse_name(name),

@@ -24,7 +24,7 @@ from dora_systemd.cli.setting_options import SettingsCommand, setting_options
 from dora_systemd.cli.terminal import StageLine
 from dora_systemd.decisions.settings.resolve import is_given
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -106,7 +106,7 @@ def command(
     """
     if want_logs and (no_wait or wants_json()):
         hint = "leave out --no-wait and --output"
-        raise DoraSystemdError("cannot print logs with --no-wait or json", hint, ExitCode.USAGE)
+        raise usage_error("cannot print logs with --no-wait or json", hint)
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ)
     if means_name(dataflow):

@@ -20,7 +20,7 @@ from dora_systemd.cli.terminal import StageLine
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells, refuse_parts, without_parts
@@ -68,8 +68,7 @@ def command(
       doractl stop --all
     """
     if force and grace_duration != INFINITY:
-        hint = "give one of them"
-        raise DoraSystemdError("cannot use --force with --grace-duration", hint, ExitCode.USAGE)
+        raise usage_error("cannot use --force with --grace-duration", "give one of them")
     most = 0 if force else min(kill_delay(grace_duration), INFINITY)
     texts = (*selectors, *([name] if name else []))
     if texts or want_all or not sys.stdin.isatty():

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import is_readable
 from dora_systemd.scope import Scope, without_systemd
 from dora_systemd.trust.paths import user_name
@@ -125,7 +125,7 @@ def encoded(signature: str, value: Any) -> list[tuple[int, Any]]:
 def _text(value: str) -> bytes:
     if not is_readable(value):
         hint = "write it as UTF-8, without NUL and noncharacters"
-        raise DoraSystemdError(f"cannot send {value!r} to systemd", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot send {value!r} to systemd", hint)
     return value.encode()
 
 

@@ -16,7 +16,7 @@ from dora_systemd.adapters.host.process import beside
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow, unset_variables
 from dora_systemd.decisions.dora.errors import UNNAMED, UNSET, UNSET_OR_OTHER, name_input
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import cannot_reach
 
@@ -82,8 +82,7 @@ class DoraCheck:
             hint = f"see {options.dora} validate {options.dataflow}"
             if f"{UNSET}: " in reason:  # at a prompt it may be set
                 hint = "set the variable by --env NAME=VALUE, or write ${NAME:-DEFAULT}"
-            message = f"cannot use {options.dataflow}: {reason}"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(f"cannot use {options.dataflow}: {reason}", hint)
 
 
 def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> str:

@@ -18,7 +18,7 @@ from dora_systemd.decisions.descriptor.dataflow import (
     session_path,
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import bad_input
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight
 
@@ -100,9 +100,8 @@ def load_dataflow(options: RunnerOptions) -> Dataflow:
     account, directory = own_account(), str(path.parent)
     done = run_dora(options.dora, ["expand", str(path)], account, os.environ, directory)
     if done.status != 0:
-        message = f"cannot expand {path}: {refusal_reason(done)}"
         hint = f"see {options.dora} expand {path}"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(f"cannot expand {path}: {refusal_reason(done)}", hint)
     return parse_dataflow(files.parse_yaml(done.stdout, path), str(path))
 
 

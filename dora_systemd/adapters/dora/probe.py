@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.decisions.cell.launch import LaunchPlan, python_of
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.trust.programs import own_account
 
 _SECONDS = 60.0
@@ -31,10 +31,9 @@ def probe_python(
         if found := _with_module(command, plan, module):
             return found
     python = " ".join(next(_interpreters(plan)))
-    raise DoraSystemdError(
+    raise bad_input(
         f"cannot {purpose}: {python} has no dora-rs",
         "run: pip install dora-rs there, or give another environment with --venv",
-        ExitCode.BAD_INPUT,
     )
 
 

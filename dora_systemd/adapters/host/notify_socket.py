@@ -13,7 +13,7 @@ import struct
 from pathlib import Path
 
 from dora_systemd.decisions.watchdog.messages import MAX_BYTES
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import bad_input
 
 MAX_PATH = 107
 """Bytes of an address, see unix(7); the nodes get it in NOTIFY_SOCKET, so it is absolute."""
@@ -32,8 +32,7 @@ class NotifySocket:
         self._path = path
         if len(os.fsencode(path)) > MAX_PATH:
             message = f"cannot make the notify socket {path}: a path has at most {MAX_PATH} bytes"
-            hint = "give the dataflow a shorter --name, or the node a shorter id"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(message, "give the dataflow a shorter --name, or the node a shorter id")
         path.unlink(missing_ok=True)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:

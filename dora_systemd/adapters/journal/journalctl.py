@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.trust.programs import check_program
 
 CHUNK = 1 << 18
@@ -83,11 +83,9 @@ def journal_output(arguments: Sequence[str], want_colors: bool = False) -> Itera
 def _complaint_error(complaint: str) -> DoraSystemdError:
     if complaint.startswith("Failed to parse timestamp"):
         hint = 'such as "2026-11-20 18:00", "10 min ago", "today" or "5m", see systemd.time(7)'
-        return DoraSystemdError(f"cannot read the time{complaint[25:]}", hint, ExitCode.USAGE)
+        return usage_error(f"cannot read the time{complaint[25:]}", hint)
     if complaint.startswith("Bad pattern"):
-        return DoraSystemdError(
-            f"cannot use the {complaint[4:]}", "see pcre2pattern(3)", ExitCode.USAGE
-        )
+        return usage_error(f"cannot use the {complaint[4:]}", "see pcre2pattern(3)")
     if " boot " in complaint:
         hint = "journalctl --list-boots shows them"
         return DoraSystemdError(f"cannot find the boot: {complaint}", hint, ExitCode.NOT_FOUND)

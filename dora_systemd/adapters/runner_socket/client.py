@@ -20,7 +20,7 @@ from typing import Any
 
 from dora_systemd import __version__
 from dora_systemd.decisions.dora.protocol import Coordinator, parse_coordinator, parse_token
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.trust.sockets import connect_unix, plain
 from dora_systemd.values import as_mapping, quoted
 
@@ -73,8 +73,7 @@ def refused_reply(error: DoraSystemdError | None) -> dict[str, Any]:
 def unknown_request(request: Request) -> DoraSystemdError:
     """The error for a request that this runner does not know: another doractl has sent it."""
     told = f"cannot do {quoted(str(request))}: the runner is of dora-systemd {__version__}"
-    hint = "doractl restart NAME starts the installed version"
-    return DoraSystemdError(told, hint, ExitCode.USAGE)
+    return usage_error(told, "doractl restart NAME starts the installed version")
 
 
 def error_reply(error: DoraSystemdError) -> dict[str, Any]:

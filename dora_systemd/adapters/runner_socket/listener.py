@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from dora_systemd.adapters.runner_socket.client import MAX_BYTES, Request, error_reply, parse_line
 from dora_systemd.adapters.runner_socket.door import Door, listen
 from dora_systemd.decisions.dora.protocol import Coordinator
-from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error, words_of
 
 _CHUNK = 1 << 16
 
@@ -140,7 +140,7 @@ async def serve(
 
 async def _answer(request: Request | None, answer: Answer, reach: Reach) -> dict[str, Any]:
     if request is None:
-        return error_reply(DoraSystemdError("cannot read the request", "", ExitCode.USAGE))
+        return error_reply(usage_error("cannot read the request"))
     try:
         if request.get("verb") == "coordinator":
             return reach().raw()

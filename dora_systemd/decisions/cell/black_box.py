@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.values import SECOND, format_size, parse_bool, parse_size, quoted
 
 KEYS = ("keep", "size")
@@ -77,7 +77,7 @@ def format_black_box(box: BlackBox | None) -> str:
 
 
 def _refusal(text: str, hint: str = _HINT) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot use {quoted(text)} as black_box", hint, ExitCode.USAGE)
+    return usage_error(f"cannot use {quoted(text)} as black_box", hint)
 
 
 def to_remove(known: Sequence[Past], keep: int) -> list[str]:

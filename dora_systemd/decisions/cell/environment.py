@@ -12,7 +12,7 @@ from dora_systemd.decisions.cell.options import (
     format_setting,
     parse_setting,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.names import is_readable
 from dora_systemd.paths import CellPaths, own_directory
 from dora_systemd.values import quoted
@@ -92,7 +92,7 @@ def parse_assignment(text: str) -> tuple[str, str]:
     key, equals, value = text.partition("=")
     if not equals:
         hint = "write KEY=VALUE, such as MODEL=yolov8n.pt"
-        raise DoraSystemdError(f"cannot set environment {quoted(text)}", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot set environment {quoted(text)}", hint)
     return checked_variable(key, value)
 
 
@@ -143,5 +143,4 @@ def _is_usable(entry: str) -> bool:
 
 
 def _refusal(key: str, hint: str) -> DoraSystemdError:
-    message = f"cannot set environment variable {quoted(key)}"
-    return DoraSystemdError(message, hint, ExitCode.USAGE)
+    return usage_error(f"cannot set environment variable {quoted(key)}", hint)

@@ -7,7 +7,7 @@ in that rest is an ordinary character, so JSON needs no other quotes around it.
 import re
 
 from dora_systemd.decisions.cell.environment import parse_assignment
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.values import shown
 
 _ENTRY = re.compile(r"(?:\s|[#;].*)*(?P<key>[^=\n]*)(?P<equals>=?)")
@@ -42,7 +42,7 @@ def parse_environment_file(text: str, source: str) -> dict[str, str]:
             # The line may contain a secret.
             number = text.count("\n", 0, match.start("key")) + 1
             message = f"cannot read line {number} of {shown(source)} as KEY=VALUE"
-            raise DoraSystemdError(message, error.hint, ExitCode.BAD_INPUT) from error
+            raise bad_input(message, error.hint) from error
     return variables
 
 
@@ -52,7 +52,7 @@ def _value(text: str, place: int) -> tuple[str, int]:
     while match := _PART.match(text, place):
         if not (match["end"] or match["ends"]):
             hint = "a quote is not closed: a value is one line of text"
-            raise DoraSystemdError("cannot read a value", hint, ExitCode.USAGE)
+            raise usage_error("cannot read a value", hint)
         place = match.end()
         in_double = match["double"]
         parts.append(match["single"] if in_double is None else _ESCAPED.sub(r"\1", in_double))

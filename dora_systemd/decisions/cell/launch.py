@@ -27,7 +27,7 @@ from dora_systemd.decisions.watchdog.watchdogs import (
     merge_watchdogs,
     watchdog_of,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.values import INFINITY, SECOND, as_mapping, quoted, shown
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
@@ -336,9 +336,7 @@ def _absolute(path: str, directory: str) -> str:
 
 
 def _refusal(source: str, node: Node, reason: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(
-        f"cannot start {source}: node {node.id}: {reason}", hint, ExitCode.BAD_INPUT
-    )
+    return bad_input(f"cannot start {source}: node {node.id}: {reason}", hint)
 
 
 def _placed_node(node: str, raw: Mapping[str, Any], machine: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.names import check_known
 from dora_systemd.values import (
     INFINITY,
@@ -173,9 +173,8 @@ def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Ite
         if one.node in free:
             hint = "limit what it is started with"
             reason = "it is dynamic, so it does not run inside the dataflow's unit"
-            message = f"cannot limit the node {quoted(one.node)}: {reason}"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(f"cannot limit the node {quoted(one.node)}: {reason}", hint)
 
 
 def _refusal(what: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot use {what}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot use {what}", hint)

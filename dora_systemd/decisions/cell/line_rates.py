@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions, SettingText
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.names import check_known
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
@@ -78,8 +78,7 @@ def rate_of(limits: RateLimits, node: str) -> RateLimit | None:
 
 
 def _refusal(text: str) -> DoraSystemdError:
-    message = f"cannot read {quoted(text)} as a rate of lines"
-    return DoraSystemdError(message, HINT, ExitCode.USAGE)
+    return usage_error(f"cannot read {quoted(text)} as a rate of lines", HINT)
 
 
 def check_rates(limits: RateLimits, nodes: Sequence[str]) -> None:

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.names import is_name, is_node_id
 from dora_systemd.values import quoted
 
@@ -67,7 +67,7 @@ def placed_on(placed: Sequence[Placed], node: str) -> str:
 
 
 def _refusal(text: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot use {quoted(text)} as a machine", hint, ExitCode.USAGE)
+    return usage_error(f"cannot use {quoted(text)} as a machine", hint)
 
 
 NOT_CONNECTED = "it is not connected yet"

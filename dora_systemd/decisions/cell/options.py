@@ -11,7 +11,7 @@ from pathlib import PurePath
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.machines import Placed, parse_head, parse_machine, parse_placed
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.values import (
     INFINITY,
@@ -382,6 +382,4 @@ def _refusal(reason: str) -> DoraSystemdError:
         "the runner is started by doractl; if that was another version, stop the dataflow and "
         "start its file again"
     )
-    return DoraSystemdError(
-        f"cannot read the runner's command line: {reason}", hint, ExitCode.USAGE
-    )
+    return usage_error(f"cannot read the runner's command line: {reason}", hint)

@@ -11,7 +11,7 @@ from dora_systemd.decisions.cell.extra import PROBE, is_extra
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, given_policies, with_values
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
@@ -95,7 +95,7 @@ def _time(key: str, text: str) -> int:
 
 
 def _wrong(reason: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot read an owed output: {reason}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot read an owed output: {reason}", hint)
 
 
 def distinct(owes: Iterable[Owed]) -> tuple[Owed, ...]:
@@ -152,10 +152,10 @@ def check_owes(
         if one.then == RESTART and (reason := _no_restart(node, restarts.get(node.id))):
             hint = f"{_OTHER}, or another restart_policy"
             hint = _OTHER if node.kind in _NEVER_RESTARTED else hint
-            raise _impossible(f"cannot restart the silent node {quoted(one.node)}: {reason}", hint)
+            raise bad_input(f"cannot restart the silent node {quoted(one.node)}: {reason}", hint)
     for probe in (one for one in by_id if is_extra(one, PROBE)):
         message = f"cannot watch outputs: the node {quoted(probe)} has a name that doractl needs"
-        raise _impossible(message, "give that node another id")
+        raise bad_input(message, "give that node another id")
 
 
 def _check_output(owed: Owed, node: Node) -> None:
@@ -165,7 +165,7 @@ def _check_output(owed: Owed, node: Node) -> None:
     outputs = sorted(node.outputs)
     message = f"cannot watch {quoted(owed.output)} of the node {quoted(node.id)}: no such output"
     known = f"outputs: {', '.join(outputs)}" if outputs else "the node has no outputs"
-    raise _impossible(message, did_you_mean(owed.output, outputs) or known)
+    raise bad_input(message, did_you_mean(owed.output, outputs) or known)
 
 
 def _no_restart(node: Node, own: RestartPolicy | None) -> str:
@@ -174,7 +174,3 @@ def _no_restart(node: Node, own: RestartPolicy | None) -> str:
         return _NEVER_RESTARTED[node.kind]
     is_never = node.restart_policy == "never" if own is None else own.policy == "no"
     return "it is never restarted, says its restart_policy" if is_never else ""
-
-
-def _impossible(message: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import quoted
 
@@ -62,7 +62,7 @@ def _parse_integer(given: str, lowest: int, highest: int, what: str, hint: str) 
 
 
 def _refusal(what: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot use {what}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot use {what}", hint)
 
 
 def is_realtime(scheduling: str) -> bool:
@@ -147,9 +147,8 @@ def check_launched(problem: str, nodes: Iterable[str], launched: Container[str])
     """
     for node in nodes:
         if node not in launched:
-            message = f"{problem} the node {quoted(node)}: something else starts it"
             hint = "what starts a dynamic or ROS 2 node gives it its rights"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(f"{problem} the node {quoted(node)}: something else starts it", hint)
 
 
 OTHERS = "*"

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.names import check_known, did_you_mean, is_node_id
 from dora_systemd.values import INFINITY, format_duration, parse_duration, quoted
 
@@ -76,7 +76,7 @@ def _time(text: str) -> int:
 
 
 def _wrong(reason: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot read the stop of a node: {reason}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot read the stop of a node: {reason}", hint)
 
 
 def within_of(stops: Stops, node: str, grace: int) -> int:
@@ -141,7 +141,7 @@ def _check_order(stops: Stops) -> None:
     except CycleError as error:
         circle = " after ".join(reversed(error.args[1]))
         message = f"cannot stop {circle}: that is a circle"
-        raise _impossible(message, "remove one of them from stop: after:") from error
+        raise bad_input(message, "remove one of them from stop: after:") from error
 
 
 def _check_time(stops: Stops, limit: int, grace: int) -> None:
@@ -154,8 +154,4 @@ def _check_time(stops: Stops, limit: int, grace: int) -> None:
         f"cannot give the node {slowest} {format_duration(stops[slowest].within or grace)} to stop:"
         f" a stop would take {needs}, and stop_limit is {format_duration(limit)}"
     )
-    raise _impossible(message, "raise stop_limit, or lower stop: within: or grace_duration")
-
-
-def _impossible(message: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    raise bad_input(message, "raise stop_limit, or lower stop: within: or grace_duration")

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterator
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.values import shown
 
 MAX_DEPTH = 64
@@ -80,4 +80,4 @@ def _children(value: object, source: str) -> Iterator[object]:
 
 def refusal(source: str, reason: str, hint: str) -> DoraSystemdError:
     """The error (BAD_INPUT) for a descriptor or settings file `source` that cannot be used."""
-    return DoraSystemdError(f"cannot use {shown(source)}: {reason}", hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot use {shown(source)}: {reason}", hint)

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dora_systemd.decisions.descriptor.json_size import is_infinite
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import parse_uuid
 from dora_systemd.terminal_text import escaped
 from dora_systemd.values import SECOND, as_mapping, quoted, scalar_text
@@ -58,9 +58,7 @@ class Request:
         value = self.body.get(key)
         if isinstance(value, str) and value:
             return value
-        raise DoraSystemdError(
-            f"cannot read the request {self.name}: it has no {key}", "", ExitCode.BAD_INPUT
-        )
+        raise bad_input(f"cannot read the request {self.name}: it has no {key}")
 
     @property
     def dataflow(self) -> str:
@@ -199,10 +197,9 @@ def _changed_env(sent: Mapping[str, Any], written: Mapping[str, Any]) -> tuple[s
     for key in [key for key, value in sent.items() if value is None]:
         # JSON has no such numbers, so dora sends null; the runner reads the value from the file.
         if not is_infinite(old.get(key, "")):
-            raise DoraSystemdError(
+            raise bad_input(
                 f"cannot start: env {quoted(key)} is infinite or not a number, and dora lost it",
                 "doractl start FILE keeps such values",
-                ExitCode.BAD_INPUT,
             )
         new.pop(key)
     return tuple(f"{key}={value}" for key, value in new.items() if old.get(key) != value)

@@ -60,7 +60,7 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.logs.records import Record, record_text
 from dora_systemd.decisions.settings.limits import LIVE_SETTINGS
 from dora_systemd.decisions.settings.nodes import NODES
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.terminal_text import escaped, one_line, without_sequences
 from dora_systemd.values import INFINITY, format_moment
 
@@ -126,7 +126,7 @@ def _is_text(value: object) -> bool:
 
 def _refusal() -> DoraSystemdError:
     hint = "the page may be of another version: reload it"
-    return DoraSystemdError("cannot read what the page sent", hint, ExitCode.USAGE)
+    return usage_error("cannot read what the page sent", hint)
 
 
 def line_values(record: Record) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.values import quoted
 
@@ -46,7 +46,7 @@ def wanted_port(option: int | None, environ: Mapping[str, str]) -> int | None:
     host, _, port = address.partition(":") if address.count(":") < 2 else (address, "", "")
     if address and host not in _LOOPBACK:
         message = f"cannot listen where {ADDRESS_VARIABLE} says: {quoted(address)} is not 127.0.0.1"
-        raise DoraSystemdError(message, _REMOTE_HINT, ExitCode.USAGE)
+        raise usage_error(message, _REMOTE_HINT)
     from_port = _parse(PORT_VARIABLE, environ.get(PORT_VARIABLE, ""))
     from_address = _parse(ADDRESS_VARIABLE, port)
     return next((one for one in (option, from_port, from_address) if one is not None), None)
@@ -71,5 +71,5 @@ def _parse(variable: str, text: str) -> int | None:
         return None
     if not _PORT.fullmatch(text) or not 0 < int(text) < 65536:
         message = f"cannot read {variable}: {quoted(text)} is not a port"
-        raise DoraSystemdError(message, "a port is 1 to 65535", ExitCode.USAGE)
+        raise usage_error(message, "a port is 1 to 65535")
     return int(text)

@@ -20,7 +20,7 @@ from dora_systemd.decisions.logs.journal_events import (
     STARTING,
     STOPPING,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.names import SLICE, unit_name
 from dora_systemd.scope import Scope
 
@@ -91,7 +91,7 @@ def parse_level(text: str) -> str:
     level = text.lower()
     if level not in LEVELS:
         known = "error, warn, info, debug, trace, stdout; those of syslog are understood too"
-        raise DoraSystemdError(f"cannot use {text!r} as a level", f"one of {known}", ExitCode.USAGE)
+        raise usage_error(f"cannot use {text!r} as a level", f"one of {known}")
     return level
 
 

@@ -7,7 +7,7 @@ from datetime import datetime
 from typing import Any
 
 from dora_systemd.decisions.cell.machines import Placed, members_of
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.terminal_text import shown_log
 from dora_systemd.values import format_moment, quoted
 
@@ -124,7 +124,7 @@ def _parsed(pair: str) -> tuple[str, str]:
     level = level.lower()
     if not node or level not in FILTER_LEVELS:
         hint = f"write NODE=LEVEL,...; levels: {', '.join(FILTER_LEVELS)}"
-        raise DoraSystemdError(f"cannot read {quoted(pair)} as a log filter", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot read {quoted(pair)} as a log filter", hint)
     return node, level
 
 

@@ -2,7 +2,7 @@
 
 import ipaddress
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.values import quoted
 
 LOOPBACK = "127.0.0.1"
@@ -23,7 +23,7 @@ def parse_address(text: str) -> str:
     """
     if reason := _problem(text):
         hint = "write the address of that machine in a network that only your machines are in"
-        raise DoraSystemdError(f"cannot use address {quoted(text)}: {reason}", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot use address {quoted(text)}: {reason}", hint)
     return str(ipaddress.ip_address(text))
 
 

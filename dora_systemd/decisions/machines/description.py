@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.terminal_text import short_line
 
 MOST_SKEW = 500_000
@@ -75,8 +75,7 @@ def _minor(version: str) -> list[str]:
 def required(found: Iterator[tuple[str, str]], machine: str) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for the first problem."""
     for reason, hint in found:
-        message = f"cannot use {machine} as a machine: {reason}"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(f"cannot use {machine} as a machine: {reason}", hint)
 
 
 def summary(facts: Facts, skew: int) -> Mapping[str, str]:

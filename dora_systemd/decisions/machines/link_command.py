@@ -12,7 +12,7 @@ from typing import NamedTuple
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.machines.wire import PORT_RANGE, Forwards
 from dora_systemd.decisions.remote.hosts import Way, parse_host, remote_command
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 
 _PROGRAMS = Path(__file__).parents[2] / "link"
 _QUICK = ("-I", "-S")
@@ -126,9 +126,8 @@ def check_forwards(forwards: Forwards, machine: str) -> None:
     is_whole = is_whole and len(ports) <= _MOST_MACHINES
     if not is_whole or len(set(ports)) < len(ports) or any(one not in PORT_RANGE for one in ports):
         first, last = PORT_RANGE[0], PORT_RANGE[-1]
-        hint = f"links take ports from {first} to {last}, each once"
         message = f"cannot forward the ports to machine {machine}"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(message, f"links take ports from {first} to {last}, each once")
 
 
 def _same(port: int) -> str:
@@ -137,4 +136,4 @@ def _same(port: int) -> str:
 
 def _no_link() -> DoraSystemdError:
     hint = "doractl start starts the links of a dataflow"
-    return DoraSystemdError("cannot read the command line of a link", hint, ExitCode.USAGE)
+    return usage_error("cannot read the command line of a link", hint)

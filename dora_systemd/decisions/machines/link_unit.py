@@ -17,7 +17,7 @@ from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.remote.hosts import parse_host
 from dora_systemd.decisions.unit.file import HEADER
 from dora_systemd.decisions.unit.properties import format_unit
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import bad_input
 from dora_systemd.names import LINK_PREFIX, SLICE, UNIT_SUFFIX, unit_name
 from dora_systemd.values import SECOND
 
@@ -70,7 +70,7 @@ def link_unit_name(name: str, machine: str) -> str:
     if len(unit) > _MOST:
         reason = f"a unit's name has at most {_MOST} characters"
         message = f"cannot link {name} to machine {machine}: {reason}"
-        raise DoraSystemdError(message, "choose a shorter --name", ExitCode.BAD_INPUT)
+        raise bad_input(message, "choose a shorter --name")
     return unit
 
 

@@ -42,7 +42,7 @@ from dora_systemd.decisions.settings.table import (
     VENV,
     WORKING_DIRECTORY,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.values import quoted, scalar_text, shown
 
 DIRECT = "direct"
@@ -121,21 +121,25 @@ def _settings(
             try:
                 yield setting, setting.kind.parse(values[setting.name], base)
             except DoraSystemdError as error:
-                raise _refusal(f"{setting.name} of {where}: {error.message}", error.hint) from error
+                raise bad_input(
+                    f"{setting.name} of {where}: {error.message}", error.hint
+                ) from error
 
 
 def _host(value: Any, where: str) -> Host:
     try:
         return parse_host(scalar_text(value))
     except DoraSystemdError as error:
-        raise _refusal(f"{HOST} of {where}: {error.message}", "write [user@]HOST[:PORT]") from error
+        raise bad_input(
+            f"{HOST} of {where}: {error.message}", "write [user@]HOST[:PORT]"
+        ) from error
 
 
 def _directory_there(value: Any, where: str) -> str:
     text = scalar_text(value) if value is not None else ""
     if text and not (text.startswith("/") and text.isprintable() and ".." not in text.split("/")):
         hint = "write an absolute path of that machine without '..'"
-        raise _refusal(f"directory of {where}: cannot use {quoted(text)}", hint)
+        raise bad_input(f"directory of {where}: cannot use {quoted(text)}", hint)
     return str(PurePath(text)) if text else ""
 
 
@@ -143,14 +147,14 @@ def _link(values: Mapping[str, Any], where: str) -> str:
     link = scalar_text(values.get("link", LINKS[0]))
     if link not in LINKS:
         hint = f"valid values: {', '.join(LINKS)}"
-        raise _refusal(f"link of {where}: cannot use {quoted(link)}", hint)
+        raise bad_input(f"link of {where}: cannot use {quoted(link)}", hint)
     if link == DIRECT and ADDRESS not in values:
         hint = "write address: and the IP address on which the machine listens for the others"
-        raise _refusal(f"{where}: link: {DIRECT} needs an address", hint)
+        raise bad_input(f"{where}: link: {DIRECT} needs an address", hint)
     for key in (ADDRESS, HEAD_ADDRESS):
         if link != DIRECT and key in values:
             hint = f"write link: {DIRECT}, or leave {key} out"
-            raise _refusal(f"{where}: {key} is for link: {DIRECT} only", hint)
+            raise bad_input(f"{where}: {key} is for link: {DIRECT} only", hint)
     return link
 
 
@@ -158,11 +162,7 @@ def _address(value: Any, key: str, where: str) -> str:
     try:
         return "" if value is None else parse_address(scalar_text(value))
     except DoraSystemdError as error:
-        raise _refusal(f"{key} of {where}: {error.message}", error.hint) from error
-
-
-def _refusal(message: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(f"{key} of {where}: {error.message}", error.hint) from error
 
 
 _KEY = re.compile(r"^machines:[ \t]*(?:#.*)?$", re.MULTILINE)
@@ -246,10 +246,9 @@ def member_of(
     """
     words = tuple(_words(machine, options, settings, variables))
     if sum(len(word.encode()) + 4 for word in words) > _MOST_BYTES:
-        raise DoraSystemdError(
+        raise bad_input(
             f"cannot start {options.name}: its settings are too long for machine {machine.name}",
             "write them into the settings file on that machine",
-            ExitCode.BAD_INPUT,
         )
     return Member(machine.name, machine.host, words)
 

@@ -15,7 +15,7 @@ from dora_systemd.decisions.cell.launch import PERL, LaunchPlan, is_launched, la
 from dora_systemd.decisions.cell.machines import HEAD, machine_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import bad_input
 from dora_systemd.terminal_text import short_line
 
 
@@ -63,10 +63,9 @@ def check_placed(options: RunnerOptions, dataflow: Dataflow) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a node that only dora itself can start."""
     for node in dataflow.nodes:
         if (machine := placed_on(options.placed, node.id)) and not is_launched(node):
-            raise DoraSystemdError(
+            raise bad_input(
                 f"cannot start {dataflow.source}: node {node.id} cannot run on machine {machine}",
                 "only nodes with a program or a Python file as their path can",
-                ExitCode.BAD_INPUT,
             )
 
 

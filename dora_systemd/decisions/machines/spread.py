@@ -30,7 +30,7 @@ from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.decisions.settings.reload import HOT_RELOAD
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.sandbox import NETWORK
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import quoted, scalar_text, shown
 
@@ -191,7 +191,7 @@ def _check_expanded(dataflow: Dataflow) -> None:
 
 
 def _refusal(source: str, reason: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot start {shown(source)}: {reason}", hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot start {shown(source)}: {reason}", hint)
 
 
 def spread(
@@ -237,7 +237,7 @@ def part(options: RunnerOptions, settings: Settings) -> RunnerOptions:
 def _check(options: RunnerOptions, settings: Settings) -> None:
     for reason, hint in _refused(options, settings):
         message = f"cannot start {shown(options.dataflow)} on several machines: {reason}"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(message, hint)
 
 
 def _refused(options: RunnerOptions, settings: Settings) -> Iterator[tuple[str, str]]:

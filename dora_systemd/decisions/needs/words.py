@@ -11,7 +11,7 @@ from pathlib import PurePosixPath
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.names import did_you_mean, is_name
 from dora_systemd.values import quoted
 
@@ -111,7 +111,7 @@ _PARSERS = {
 
 
 def _refusal(text: str, hint: str, reason: str = "") -> DoraSystemdError:
-    return DoraSystemdError(f"cannot wait for {quoted(text)}{reason}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot wait for {quoted(text)}{reason}", hint)
 
 
 @lru_cache(maxsize=4)
@@ -124,8 +124,7 @@ def needs_of(options: RunnerOptions) -> tuple[NodeNeed, ...]:
 def check_needs(needs: Sequence[NodeNeed], launched: Container[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a need of a node that our launcher does not start."""
     if other := next((one for one in needs if one.node not in launched), None):
-        raise DoraSystemdError(
+        raise bad_input(
             f"node {other.node} cannot wait for {other.what}: dora itself starts this node",
             "operators, ros2, dynamic nodes and path_sha256: write needs: for another node",
-            ExitCode.BAD_INPUT,
         )

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Sequence
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.names import NOTICE_PREFIX, UNIT_PREFIX, is_readable
 from dora_systemd.values import quoted
 
@@ -74,4 +74,4 @@ def unit_of(words: Words, name: str) -> str:
 
 
 def _refusal(text: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot use {quoted(text)} as on_failure", hint, ExitCode.USAGE)
+    return usage_error(f"cannot use {quoted(text)} as on_failure", hint)

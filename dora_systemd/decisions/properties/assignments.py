@@ -13,7 +13,7 @@ from dora_systemd.decisions.properties.table import (
     bus_name,
     plain_kind,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.names import STORE, did_you_mean
 from dora_systemd.values import quoted, shown
 
@@ -209,7 +209,7 @@ def _bad_value(row: Row, text: str, reason: Exception | None) -> DoraSystemdErro
 
 
 def _refusal(what: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot set property {what}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot set property {what}", hint)
 
 
 def _joined(old: Property, new: Property) -> Property:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.values import SECOND, format_rounded_size, shown
 
 MOST_FILES = 100_000
@@ -131,7 +131,7 @@ def of_project(files: Mapping[str, Stored]) -> dict[str, Stored]:
 
 def refusal(path: str, reason: str, hint: str) -> DoraSystemdError:
     """The error for a file of a project that is not copied."""
-    return DoraSystemdError(f"cannot copy {shown(path)}: {reason}", hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot copy {shown(path)}: {reason}", hint)
 
 
 def _trouble_of_link(path: str, target: str) -> str:
@@ -199,8 +199,7 @@ def parse_manifest(text: str, path: str) -> Manifest:
         return Manifest(**texts, created_us=created_us, versions=versions, files=files, given=given)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         message = f"cannot use {shown(path)}: it does not describe a release"
-        hint = "remove that release, or deploy again"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT) from error
+        raise bad_input(message, "remove that release, or deploy again") from error
 
 
 def format_stored(one: Stored) -> dict[str, Any]:

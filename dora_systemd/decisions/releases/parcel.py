@@ -24,7 +24,7 @@ from dora_systemd.decisions.releases.manifest import (
     parse_stored,
     too_many,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import parse_name
 from dora_systemd.values import as_mapping
 
@@ -138,5 +138,4 @@ def total(contents: Sequence[Stored]) -> int:
 
 
 def _refusal(reason: str, hint: str) -> DoraSystemdError:
-    message = f"cannot read a project from standard input: {reason}"
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot read a project from standard input: {reason}", hint)

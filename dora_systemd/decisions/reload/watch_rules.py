@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import PurePath
 from typing import TYPE_CHECKING
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.values import quoted
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def parse_patterns(texts: Iterable[str]) -> tuple[str, ...]:
         is_plain = pattern.isprintable() and ".." not in PurePath(pattern).parts
         if not is_plain or not _is_pattern(pattern):
             hint = "write patterns as in gitignore(5), such as *.py or config/*"
-            raise DoraSystemdError(f"cannot watch {quoted(pattern)}", hint, ExitCode.USAGE)
+            raise usage_error(f"cannot watch {quoted(pattern)}", hint)
     return tuple(patterns)
 
 
@@ -120,8 +120,7 @@ def _relative_pattern(pattern: str, root: str) -> str:
         return pattern
     if not pattern.startswith(f"{root}/"):
         hint = "watched files are in the working directory; see --working-directory"
-        message = f"cannot watch {quoted(pattern)}: it is outside of {root}"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(f"cannot watch {quoted(pattern)}: it is outside of {root}", hint)
     return pattern.removeprefix(root)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence, Set
 from typing import NamedTuple
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 
 SHORT, LONG = "-H", "--host"
 
@@ -99,7 +99,7 @@ def _next(rest: Iterator[str], option: str) -> str:
     value = next(rest, None)
     if value is None:
         hint = "[user@]HOST, several with commas, or all"
-        raise DoraSystemdError(f"option {option} requires a host", hint, ExitCode.USAGE)
+        raise usage_error(f"option {option} requires a host", hint)
     return value
 
 

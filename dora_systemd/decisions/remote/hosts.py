@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from dora_systemd.errors import REACHED_AS, DoraSystemdError, ExitCode
+from dora_systemd.errors import REACHED_AS, DoraSystemdError, bad_input, usage_error
 from dora_systemd.values import quoted
 
 ALL = "all"
@@ -48,7 +48,7 @@ def parse_host(text: str) -> Host:
     port = (match and match["port"]) or ""
     if match is None or (port and not 0 < int(port) <= _MAX_PORT):
         hint = "[user@]HOST[:PORT], several with commas, or all"
-        raise DoraSystemdError(f"cannot use {quoted(text)} as a host", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot use {quoted(text)} as a host", hint)
     name = match["address"] or match["inner"] or match["name"]
     return Host(text, f"{match['user'] or ''}{name}", port)
 
@@ -73,15 +73,13 @@ def _lines(text: str, path: str) -> Iterator[Host]:
     for number, line in enumerate(text.splitlines(), 1):
         if word := line.partition("#")[0].strip():
             if word == ALL:
-                hint = "write a host in each line"
                 what = f"cannot read {path}: line {number}: {ALL} stands for the hosts of this file"
-                raise DoraSystemdError(what, hint, ExitCode.BAD_INPUT)
+                raise bad_input(what, "write a host in each line")
             try:
                 yield parse_host(word)
             except DoraSystemdError as error:
                 what = f"cannot read {path}: line {number}: {error.message}"
-                hint = "write one [user@]HOST[:PORT] in each line"
-                raise DoraSystemdError(what, hint, ExitCode.BAD_INPUT) from error
+                raise bad_input(what, "write one [user@]HOST[:PORT] in each line") from error
 
 
 CONNECT_SECONDS = 5

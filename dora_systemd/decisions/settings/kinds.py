@@ -13,7 +13,7 @@ from dora_systemd.decisions.cell.environment import (
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.nodes import Node
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.values import (
     format_bool,
     format_duration,
@@ -155,8 +155,7 @@ def many_texts(
 
 def _checked_text(text: str) -> str:
     if not text.strip() or not text.isprintable():
-        hint = "write one line of plain text"
-        raise DoraSystemdError(f"cannot read {quoted(text)} as a text", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot read {quoted(text)} as a text", "write one line of plain text")
     return text
 
 

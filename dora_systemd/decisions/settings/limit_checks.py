@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from dora_systemd.decisions.cell.limits import BY_KEY, CPUS, LIMITS, NodeLimits
 from dora_systemd.decisions.properties.assignments import Properties
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.values import (
     INFINITY,
     SECOND,
@@ -60,11 +60,10 @@ def check_cpus(nodes: Iterable[NodeLimits], machine: Machine) -> None:
     for one in nodes:
         wanted = set(cpu_numbers(dict(one.limits).get(CPUS, 0)))
         if machine.cpus is not None and (missing := wanted - machine.cpus):
-            raise DoraSystemdError(
+            raise bad_input(
                 f"cannot bind the node {one.node} to the cpus {_cpu_list(missing)}: "
                 "this machine has none with that number",
                 f"its cpus are {_cpu_list(machine.cpus)}",
-                ExitCode.BAD_INPUT,
             )
 
 

@@ -12,7 +12,7 @@ from dora_systemd.decisions.cell.rights import is_negative, parse_nice
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text
 from dora_systemd.decisions.settings.rights import check_rights
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.values import quoted
 
 _DEVICE = re.compile(r"(/dev/\S+?|(?:char|block)-\S+?)(?:[: ]([rwm]+))?")
@@ -59,8 +59,7 @@ def _parse_realtime(given: str) -> str:
     match = _REALTIME.fullmatch(text)
     if not match or int(match[2]) == 0:
         hint = "write a priority from 1 to 99, with rr: or fifo: in front of it or without"
-        message = f"cannot use {quoted(text)} as realtime priority"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(f"cannot use {quoted(text)} as realtime priority", hint)
     return f"{match[1] or 'rr'}:{int(match[2])}"
 
 
@@ -69,7 +68,7 @@ def _parse_device(text: str) -> str:
     match = _DEVICE.fullmatch(text.strip())
     if not match or not text.isprintable():
         hint = "write a path below /dev, or char-GROUP; :r behind it lets it be read only"
-        raise DoraSystemdError(f"cannot allow the device {quoted(text)}", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot allow the device {quoted(text)}", hint)
     return f"{match[1]} {match[2] or _DEFAULT_ACCESS}"
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.machines import parse_machine
 from dora_systemd.decisions.settings.kinds import Base, Kind, Setting, texts_of
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.values import quoted, scalar_text
 
 HOST = "host"
@@ -38,7 +38,7 @@ def _split(text: str) -> tuple[str, Mapping[str, str]]:
     name, equals, host = text.partition("=")
     if not equals or not host:
         hint = "write NAME=[user@]HOST, such as gpu=alice@gpu-box"
-        raise DoraSystemdError(f"cannot use {quoted(text)} as a machine", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot use {quoted(text)} as a machine", hint)
     return name, {HOST: host}
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from dora_systemd.decisions.settings.kinds import Base, Kind, Setting, texts_of
-from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
+from dora_systemd.errors import DoraSystemdError, WrongKey, usage_error
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import quoted
 
@@ -96,7 +96,7 @@ def _hint(key: str, known: Sequence[str]) -> str:
 
 
 def _refusal(what: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot use {what}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot use {what}", hint)
 
 
 def _texts(nodes: Nodes, known: _Known) -> Iterator[str]:

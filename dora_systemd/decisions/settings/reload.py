@@ -9,14 +9,14 @@ from dora_systemd.decisions.reload.watch_rules import (
     relative_patterns,
 )
 from dora_systemd.decisions.settings.kinds import BOOL, Setting, many_texts, one_text
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.values import quoted
 
 
 def _parse_replace(text: str) -> str:
     if text not in REPLACE_WORDS:
         hint = f"write {' or '.join(REPLACE_WORDS)}"
-        raise DoraSystemdError(f"cannot replace a node {quoted(text)}", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot replace a node {quoted(text)}", hint)
     return text
 
 

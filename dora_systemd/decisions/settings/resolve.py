@@ -31,7 +31,7 @@ from dora_systemd.decisions.settings.table import (
     SETTINGS,
     UV,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
+from dora_systemd.errors import DoraSystemdError, WrongKey, usage_error
 from dora_systemd.values import shown
 
 T = TypeVar("T")
@@ -198,8 +198,7 @@ def _parsed(setting: Setting[Any], value: object, where: str, base: Base) -> Any
         return setting.kind.parse(value, base)
     except DoraSystemdError as error:
         place = " ".join(filter(None, (where, ":".join(_inner(error)))))
-        message = f"{error.message} ({place})"
-        raise DoraSystemdError(message, error.hint, ExitCode.USAGE) from error
+        raise usage_error(f"{error.message} ({place})", error.hint) from error
 
 
 def _merged(setting: Setting[Any], given: Sequence[Given]) -> Given:

@@ -22,7 +22,7 @@ from dora_systemd.decisions.settings.kinds import (
     one_text,
     texts_of,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import quoted, scalar_text
 
@@ -48,19 +48,18 @@ def _parse_one(text: str, base: Base) -> tuple[str, str]:
     name, equals, file = text.partition("=")
     if not equals:
         hint = "write NAME=FILE, such as token=/etc/robot/token"
-        raise DoraSystemdError(f"cannot set credential {quoted(text)}", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot set credential {quoted(text)}", hint)
     return _pair(name, file, base)
 
 
 def _pair(name: str, file: Any, base: Base) -> tuple[str, str]:
     if not _NAME.fullmatch(name):
         hint = "a name is ASCII without blanks, '/' and ':', as that of a file"
-        raise DoraSystemdError(f"cannot name a credential {quoted(name)}", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot name a credential {quoted(name)}", hint)
     path = PATH.parse(file, base)
     if path.endswith("\\"):
         # In a unit file the backslash would continue the line.
-        hint = "give the file another name"
-        raise DoraSystemdError(f"cannot use {quoted(path)} as credential", hint, ExitCode.USAGE)
+        raise usage_error(f"cannot use {quoted(path)} as credential", "give the file another name")
     return name, path
 
 
@@ -90,7 +89,7 @@ def _choice(what: str, metavar: str, choices: Sequence[str]) -> Kind[str]:
         text = given.strip()
         if text not in choices:
             hint = did_you_mean(text, choices) or f"valid values: {', '.join(choices)}"
-            raise DoraSystemdError(f"cannot use {quoted(text)} as {what}", hint, ExitCode.USAGE)
+            raise usage_error(f"cannot use {quoted(text)} as {what}", hint)
         return text
 
     return one_text(str, expected, metavar, parse)

@@ -40,7 +40,7 @@ from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.sandbox import credential_properties
 from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.names import SLICE, notice_hold_unit, notice_unit, release_of, unit_description
 from dora_systemd.scope import NOTICE_NAME, RUNTIME_NAME
 from dora_systemd.values import INFINITY, SECOND, quoted
@@ -249,7 +249,7 @@ def user_properties(context: UnitContext) -> dict[str, Property]:
         return {}
     if context.is_user:
         message = f"cannot run as the user {quoted(context.user)} in user scope"
-        raise DoraSystemdError(message, "leave --uid out or add --system", ExitCode.USAGE)
+        raise usage_error(message, "leave --uid out or add --system")
     return typed(User=context.user)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.properties.kinds import Property
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.values import quoted
 
 Told = tuple[str, str, Any]
@@ -107,7 +107,7 @@ def _plain_commands(one: Told, systemd_version: int) -> Told:
             key, words = name.removesuffix("Ex"), quoted(" ".join(argv))
             message = f"cannot keep {key}={words} over a reload of systemd {systemd_version}"
             hint = 'use paths without "$", and command lines without "+" and "!"'
-            raise DoraSystemdError(message, hint, ExitCode.USAGE)
+            raise usage_error(message, hint)
     plain = tuple((path, argv, "ignore-failure" in flags) for path, argv, flags in commands)
     return name.removesuffix("Ex"), "a(sasb)", plain
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from dora_systemd.decisions.views.dataflows import format_table
 from dora_systemd.decisions.views.formats import UNKNOWN
 from dora_systemd.decisions.views.rows import Holder
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.terminal_text import cut, short_line
 
 _HEADER = ("NAME", "NODE", "PID", "USER", "COMMAND", "WHY")
@@ -82,8 +82,7 @@ def parse_reason(text: str) -> str:
     """A reason as `--why` takes it, in one line. Raises DoraSystemdError (USAGE) if it is empty."""
     reason = short_line(text, MAX_REASON)
     if not reason:
-        hint = "such as --why 'it is driving'"
-        raise DoraSystemdError("cannot inhibit without a reason", hint, ExitCode.USAGE)
+        raise usage_error("cannot inhibit without a reason", "such as --why 'it is driving'")
     return reason
 
 

@@ -5,7 +5,7 @@ The terms are those of WatchdogSec= in systemd.service(5) and of sd_notify(3).
 
 from collections.abc import Container, Mapping
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.values import INFINITY, SECOND, parse_duration, quoted
 
 ALL_NODES = ""
@@ -67,8 +67,8 @@ def check_watchdogs(watchdogs: Watchdogs, launched: Container[str]) -> None:
             hint = (
                 "operators, dynamic nodes and nodes of ROS 2 or with path_sha256 have no watchdog"
             )
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(message, hint)
 
 
 def _refusal(text: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot use {quoted(text)} as watchdog", HINT, ExitCode.USAGE)
+    return usage_error(f"cannot use {quoted(text)} as watchdog", HINT)

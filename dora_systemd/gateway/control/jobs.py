@@ -27,7 +27,7 @@ from dora_systemd.decisions.gateway.answers import stopped
 from dora_systemd.decisions.gateway.frames import Request, sent_flags
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.gateway.control.session import Result, Talk, find_by_uuid
 from dora_systemd.gateway.control.state import ended_result, spawned
 from dora_systemd.scope import Scope
@@ -81,7 +81,7 @@ def wanted_start(request: Request) -> StartRequest:
         hint = "unset DORA_WRITE_EVENTS_TO, or use dora run"
         raise DoraSystemdError("cannot write the events of a supervised dataflow", hint)
     if not isinstance(request.body.get("dataflow"), dict):
-        raise DoraSystemdError("cannot start: no dataflow was sent", "", ExitCode.BAD_INPUT)
+        raise bad_input("cannot start: no dataflow was sent")
     name = request.body.get("name")
     path = find_file(Path(request.text("local_working_dir")), request.text("session_id"))
     flags = sent_flags(request, written_dataflow(str(path)).raw)
@@ -114,7 +114,7 @@ def _files(directory: Path) -> list[Path]:
 
 
 def _no_file(message: str) -> DoraSystemdError:
-    return DoraSystemdError(message, "doractl start FILE takes the file itself", ExitCode.BAD_INPUT)
+    return bad_input(message, "doractl start FILE takes the file itself")
 
 
 def _session(path: Path) -> object:

@@ -34,7 +34,7 @@ from dora_systemd.decisions.machines.wire import (
     format_message,
     parse_message,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import start_coordinator
 from dora_systemd.runner.cell.boot import Boot, EarlyDaemon
@@ -189,4 +189,4 @@ def received() -> socket.socket:
 def no_head() -> DoraSystemdError:
     """Return the error of a member that has received no Part."""
     hint = "doractl start on the head starts the members"
-    return DoraSystemdError("cannot run a member: no head says what to run", hint, ExitCode.USAGE)
+    return usage_error("cannot run a member: no head says what to run", hint)

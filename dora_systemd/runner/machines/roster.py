@@ -25,7 +25,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.address import endpoint
 from dora_systemd.decisions.machines.usage import merged
-from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input, usage_error, words_of
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.machines.boot import GREETED, forwards
 from dora_systemd.runner.machines.lines import Lines
@@ -74,7 +74,7 @@ class Member:
 def _refusal(name: str, member: Member) -> DoraSystemdError | None:
     if (told := member.checked) is not None:
         reason, hint = short_line(told.reason, _LONGEST), short_line(told.hint, _LONGEST)
-        error = DoraSystemdError(f"machine {name}: {reason}", hint, ExitCode.BAD_INPUT)
+        error = bad_input(f"machine {name}: {reason}", hint)
         return error if reason else None
     reason = "it does not answer" if member.work else member.words
     message = f"cannot reach machine {name}: {reason}"
@@ -192,7 +192,7 @@ class Roster:
         name = str(request.get("machine"))
         if name not in self._members:
             message = f"machine {quoted(name)} has no node of this dataflow"
-            await refuse(ends, DoraSystemdError(message, "", ExitCode.USAGE))
+            await refuse(ends, usage_error(message))
             return
         if self._is_closed:
             await refuse(ends, DoraSystemdError("the run ends", "the next one has other ports"))

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from dora_systemd.adapters.runner_socket.client import done_of, order
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.paths import CellPaths, own_directory
 
 MOST_SECONDS = 24 * 3600.0
@@ -22,7 +22,7 @@ def main() -> int:
     try:
         if not directory:
             hint = "systemd runs this: use `doractl reload`"
-            raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
+            raise usage_error("cannot run without RUNTIME_DIRECTORY", hint)
         path = CellPaths(Path(directory)).socket
         done = done_of(path, order(path, {"verb": "reload", "is_job": True}, most=MOST_SECONDS))
     except DoraSystemdError as error:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host import files, process
 from dora_systemd.decisions.cell.options import SettingText, format_setting, parse_setting
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight
 
@@ -60,7 +60,7 @@ class SettingsFile:
         command = [sys.executable, "-E", "-P", "-m", __name__, *versions, self.path]
         done = process.run_command(command, _SECONDS, os.environ, account=own_account())
         if done.status:
-            raise DoraSystemdError(done.stderr.strip(), "", ExitCode.BAD_INPUT)
+            raise bad_input(done.stderr.strip())
         found = json.loads(done.stdout)
         return tuple(map(parse_setting, found["limits"])), tuple(found["others"])
 

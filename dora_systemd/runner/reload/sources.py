@@ -25,7 +25,7 @@ from dora_systemd.decisions.reload.changes import (
 )
 from dora_systemd.decisions.reload.imports import program_files, syntax_error
 from dora_systemd.decisions.reload.watch_rules import WatchRules
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import bad_input
 from dora_systemd.runner.cell.begin import let_openssl_in
 
 _LONGEST_SECONDS = 10.0
@@ -98,7 +98,7 @@ class Change:
             return self
         if self.prepared.dataflow.node(node) is None:
             message = f"cannot reload the node {node}: it is not in {dataflow}"
-            raise DoraSystemdError(message, "add it to that file", ExitCode.BAD_INPUT)
+            raise bad_input(message, "add it to that file")
         operators = self.operators.get(node, {})
         steps = [Step(How.OPERATOR, node, file) for name, file in operators.items() if name]
         if not steps:
@@ -153,8 +153,7 @@ class Sources:
         options = self._options
         prepared = prepare(options, self._environment, is_reload=True)
         if reason := refusal_of_dora(options, self._environment):
-            message = f"cannot use {options.dataflow}: {reason}"
-            raise DoraSystemdError(message, "", ExitCode.BAD_INPUT)
+            raise bad_input(f"cannot use {options.dataflow}: {reason}")
         return prepared
 
     def replan(self, current: Prepared) -> Prepared:
@@ -218,10 +217,9 @@ def check_programs(paths: Iterable[str]) -> None:
             with Path(path).open(errors="replace") as file:
                 text = file.read() if is_python else ""  # a binary may have a gigabyte
         except OSError as error:
-            message = f"cannot use {path}: {error.strerror}"
-            raise DoraSystemdError(message, "", ExitCode.BAD_INPUT) from error
+            raise bad_input(f"cannot use {path}: {error.strerror}") from error
         if is_python and (reason := syntax_error(path, text)):
-            raise DoraSystemdError(f"cannot use {path}: {reason}", "", ExitCode.BAD_INPUT)
+            raise bad_input(f"cannot use {path}: {reason}")
 
 
 def _read(path: str) -> str | None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.journal.reader import JournalReader, read_when_written
 from dora_systemd.decisions.logs.query import LogQuery
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.ended import not_recorded
@@ -113,7 +113,7 @@ def _with_nodes(
     """Add the nodes to the queries; leave out queries of dataflows without any of the nodes."""
     if not queries[0].name:
         hint = "say which dataflow: doractl logs NAME --node NODE"
-        raise DoraSystemdError("cannot select nodes of all dataflows", hint, ExitCode.USAGE)
+        raise usage_error("cannot select nodes of all dataflows", hint)
     known = [journal.known_nodes(one.scope, one.name) for one in queries]
     if not patterns:
         every = zip(queries, known, strict=True)
@@ -158,7 +158,7 @@ def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
         return replace(query, run=run)
     if not query.name:
         hint = "say which dataflow: doractl logs NAME --run CURRENT"
-        raise DoraSystemdError("cannot select a run of all dataflows", hint, ExitCode.USAGE)
+        raise usage_error("cannot select a run of all dataflows", hint)
     lives = journal.invocations(query.scope, query.name, query.uuid)
     invocation = next(islice(lives, index, None), None)
     if invocation is None:

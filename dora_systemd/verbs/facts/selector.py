@@ -12,7 +12,7 @@ from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, TypeVar
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import (
     MIN_PREFIX,
     UNIT_PREFIX,
@@ -79,8 +79,7 @@ class Selector:
         found = self.meant(known)
         if len(found) > 1:
             candidates = ", ".join(f"{one.uuid} ({one.name})" for one in found[:_SHOWN])
-            message = f"{quoted(self.text)} is ambiguous"
-            raise DoraSystemdError(message, f"one of {candidates}", ExitCode.USAGE)
+            raise usage_error(f"{quoted(self.text)} is ambiguous", f"one of {candidates}")
         return found[0] if found else None
 
     def missing(self, names: Iterable[str]) -> DoraSystemdError:

@@ -35,7 +35,7 @@ from dora_systemd.decisions.machines.wire import (
     parse_message,
 )
 from dora_systemd.decisions.unit.systemd_versions import transient_commands
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
@@ -131,20 +131,20 @@ def become_relay(runner: socket.socket) -> NoReturn:
 def _check_part(part: Part, start: StartRequest) -> None:
     """Raise DoraSystemdError unless the head's doractl and its runner name the same dataflow."""
     if (part.name, part.uuid, part.machine) != (start.name, start.uuid, start.machine):
-        raise _refusal("the head's runner wants to run another dataflow than its doractl")
+        raise bad_input("the head's runner wants to run another dataflow than its doractl")
 
 
 def _check_forwards(part: Part) -> None:
     """Raise DoraSystemdError if GatewayPorts of sshd_config(5) opens the ports to the network."""
     if is_open_beyond(part.coordinator):
         hint = "on that machine, in sshd_config: GatewayPorts no"
-        raise _refusal("sshd there opens forwarded ports to the whole network", hint)
+        raise bad_input("sshd there opens forwarded ports to the whole network", hint)
 
 
 def _check_linger(scope: Scope) -> None:
     if scope.is_user and is_lingering(scope) is False:
         hint = f"on that machine, as root: {linger_command(scope)}"
-        raise _refusal("the user there does not linger, so it would end with this session", hint)
+        raise bad_input("the user there does not linger, so it would end with this session", hint)
 
 
 def _wait_for_address(request: MemberRequest, is_passing: bool) -> None:
@@ -202,10 +202,10 @@ def _check_same(part: Part, plan: Plan) -> None:
     if version_numbers(part.doractl)[:2] != version_numbers(__version__)[:2]:
         hint = "install the same version of dora-systemd on both machines"
         there = plain(part.doractl)
-        raise _refusal(f"it has dora-systemd {__version__}, the head has {there}", hint)
+        raise bad_input(f"it has dora-systemd {__version__}, the head has {there}", hint)
     path = plan.options.dataflow
     if hashlib.sha256(read_file(path).data).hexdigest() != part.digest:
-        raise _refusal(format_other_file(path), COPY_HINT)
+        raise bad_input(format_other_file(path), COPY_HINT)
 
 
 def _start_transient(
@@ -268,10 +268,6 @@ def _first_line(runner: socket.socket, seconds: float = _START_SECONDS) -> bytes
     with suppress(OSError):
         return read_line(runner.fileno(), time.monotonic() + seconds)
     return b""
-
-
-def _refusal(reason: str, hint: str = "") -> DoraSystemdError:
-    return DoraSystemdError(reason, hint, ExitCode.BAD_INPUT)
 
 
 class Head:

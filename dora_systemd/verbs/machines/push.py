@@ -16,7 +16,7 @@ from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.ssh_failures import SSH_FAILED, last_line, unreached
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.names import settings_path
 from dora_systemd.terminal_text import short_line
 from dora_systemd.trust.programs import check_program
@@ -102,8 +102,7 @@ def _first_words(said: str) -> str:
 
 def refusal(member: Member, reason: str, hint: str) -> DoraSystemdError:
     """Return the error for a copy that failed, after which nothing is started."""
-    message = f"cannot copy the dataflow to machine {member.machine}: {reason}"
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot copy the dataflow to machine {member.machine}: {reason}", hint)
 
 
 _SECONDS = 24 * 3600.0
@@ -123,9 +122,8 @@ def push(
     """
     dataflow = plan.options.dataflow
     if not plan.members:
-        hint = "leave out --push, or write deploy: {machine: NAME} at a node"
         message = f"cannot copy {shown(dataflow)}: all of its nodes run on this machine"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(message, "leave out --push, or write deploy: {machine: NAME} at a node")
     _check_here(Path(dataflow).parent)
     for member in plan.members:
         stage(f"asking machine {member.machine}")
@@ -138,8 +136,7 @@ def push(
 def _check_here(directory: Path) -> None:
     if problem := place_problem(directory, "as the user of the nodes: doractl --user start"):
         reason, hint = problem
-        message = f"cannot copy {shown(str(directory))}: {reason}"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(f"cannot copy {shown(str(directory))}: {reason}", hint)
 
 
 def _copy(member: Member, dataflow: str) -> None:

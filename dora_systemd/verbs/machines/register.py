@@ -22,7 +22,7 @@ from dora_systemd.decisions.machines.member import parse_entry, with_machine, wi
 from dora_systemd.decisions.machines.wire import PORT_RANGE
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.machines import MACHINES
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
@@ -47,7 +47,7 @@ def authorized_line(program: str, public: str, comment: str) -> str:
     what is no public key, and for a path that cannot stand there.
     """
     if not re.fullmatch(r"/[A-Za-z0-9_./+-]+", program):
-        raise _refusal(f"cannot use {quoted(program)} there as doractl", "link it into /usr/bin")
+        raise bad_input(f"cannot use {quoted(program)} there as doractl", "link it into /usr/bin")
     key = _public(public)
     # sshd(8) has no ranges there, and * would be each service that listens on that machine.
     only = ",".join(
@@ -68,7 +68,7 @@ def _public(text: str) -> str:
     """The key without its comment."""
     found = _PUBLIC.match(text)
     if not found:
-        raise _refusal("cannot read the public key", "see ssh-keygen(1)")
+        raise bad_input("cannot read the public key", "see ssh-keygen(1)")
     return found[0]
 
 
@@ -88,12 +88,7 @@ def forced_words(original: str) -> tuple[str, list[str]]:
 
 
 def _not_allowed() -> DoraSystemdError:
-    hint = "log in with another key"
-    return DoraSystemdError("this key can only run parts of dataflows", hint, ExitCode.USAGE)
-
-
-def _refusal(message: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    return usage_error("this key can only run parts of dataflows", "log in with another key")
 
 
 _INSTALL = (
@@ -237,8 +232,7 @@ def _checked(file: Path, before: str, text: str | None, name: str, added: str = 
     wanted |= {"machines": machines} if machines else {}
     if text is None or file.is_symlink() or _document(file, text) != wanted:
         what = f"write {name}: {{host: {added}}} below" if added else f"remove {name} below"
-        message = f"cannot change {shown(str(file))} by itself"
-        raise DoraSystemdError(message, f"{what} machines: there", ExitCode.BAD_INPUT)
+        raise bad_input(f"cannot change {shown(str(file))} by itself", f"{what} machines: there")
     return text
 
 

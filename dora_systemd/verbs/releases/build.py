@@ -43,7 +43,7 @@ from dora_systemd.decisions.releases.manifest import (
     too_many,
 )
 from dora_systemd.decisions.releases.progress import copying
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import reached
 from dora_systemd.trust.project import Project, opened_project
@@ -212,7 +212,7 @@ def _check_end(manager: Manager, build: Build) -> None:
     hint = _hint(build)
     result = str(manager.read(build.unit, ["Result"])["Result"])
     if refusal := runners_refusal(manager, build.unit):
-        raise DoraSystemdError(refusal.message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(refusal.message, hint)
     if result == "timeout":
         raise _late(build, hint)
     if result != "success":

@@ -28,7 +28,7 @@ from dora_systemd.decisions.releases.parcel import (
 )
 from dora_systemd.decisions.releases.progress import copying, waiting
 from dora_systemd.decisions.settings.table import USER, WORKING_DIRECTORY
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.locks import IfInhibited, require_uninhibited
@@ -169,8 +169,7 @@ def _fill(
 
 def _require_same(path: str, announced: Stored, stored: Stored) -> None:
     if announced != stored:
-        message = f"cannot receive {path}: it is not what was announced"
-        raise DoraSystemdError(message, "deploy again", ExitCode.BAD_INPUT)
+        raise bad_input(f"cannot receive {path}: it is not what was announced", "deploy again")
 
 
 def _source(

@@ -11,7 +11,7 @@ from dora_systemd.decisions.releases.past import before
 from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.decisions.why.trial_faults import Fault
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.names import did_you_mean, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_directory
@@ -69,9 +69,8 @@ def roll_back(
         text = store.unit(chosen)
         options, manifest = runner_of(text, can_start=True), store.manifest(chosen)
         if options is None or options.name != store.name:
-            hint = f"doractl releases {store.name} lists the others"
             message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(message, f"doractl releases {store.name} lists the others")
         if chosen != standing.current:  # what every start runs anyway
             tell(checking())
             _require_intact(store, manifest)
@@ -98,9 +97,8 @@ def _require_intact(store: Store, manifest: Manifest) -> None:
     if damaged := sorted(manifest.files.keys() - store.intact(manifest).keys()):
         more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
         reason = f"{shown(damaged[0])}{more} changed on the disk"
-        hint = f"check the disk; doractl releases {store.name} lists the others"
         message = f"cannot run release {manifest.id} of {store.name}: it is damaged: {reason}"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(message, f"check the disk; doractl releases {store.name} lists the others")
 
 
 def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell: Tell) -> Deployed:

@@ -16,7 +16,7 @@ from dora_systemd.decisions.releases.manifest import Found, Stored, refusal
 from dora_systemd.decisions.releases.parcel import Parcel
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.table import ENV_FILE, VENV, WORKING_DIRECTORY
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
@@ -194,16 +194,15 @@ def _require_roots(root: str, found: Iterable[str]) -> None:
             if not place.is_roots:
                 message = f"cannot read {shown(place.path)} as root: others can change it"
                 hint = f"let its owner deploy it, or make the user {DEFAULT_USER}, who reads it"
-                raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+                raise bad_input(message, hint)
 
 
 def _require_own(found: Mapping[str, Found], root: str, dataflow: Dataflow) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for what is not in the parcel and only works here."""
     if os.path.relpath(dataflow.source, root) not in found:
         message = f"cannot send {shown(dataflow.source)}: it is not in the project"
-        raise DoraSystemdError(message, "deploy a file, no link to it", ExitCode.BAD_INPUT)
+        raise bad_input(message, "deploy a file, no link to it")
     for node in dataflow.nodes:
         if node.path.startswith(f"{root.rstrip('/')}/"):
             message = f"cannot send node {node.id}: its path {shown(node.path)} is of this machine"
-            hint = f"write it relative to {shown(root)}"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise bad_input(message, f"write it relative to {shown(root)}")

@@ -11,7 +11,7 @@ from dora_systemd.decisions.descriptor.nodes import Node, NodeKind, operator_fil
 from dora_systemd.decisions.releases.build import built_nodes, has_builds, is_moving, lock_places
 from dora_systemd.decisions.releases.manifest import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
@@ -228,7 +228,7 @@ def _is_below(path: str, directory: str) -> bool:
 
 
 def _refusal(reason: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot deploy: {reason}", hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot deploy: {reason}", hint)
 
 
 def find_builders(plan: Plan, dataflow: Dataflow, root: str) -> tuple[str, str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded
 from dora_systemd.decisions.remote.hosts import ALL, Host, parse_host, parse_hosts_file
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.scope import config_home
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists, hint_of_changeable
@@ -54,4 +54,4 @@ def _read(path: Path) -> str:
 
 def _no_host(reason: str, path: Path) -> DoraSystemdError:
     hint = f"write one [user@]HOST[:PORT] in each line of {path}"
-    return DoraSystemdError(f"cannot use all hosts: {reason}", hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot use all hosts: {reason}", hint)

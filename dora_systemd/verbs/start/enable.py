@@ -34,7 +34,7 @@ from dora_systemd.decisions.unit.file import (
     runner_of,
     without_install,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import name_from_unit, notice_hold_unit, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -105,8 +105,7 @@ def enable_cell(
     refuse_member(cell.options)
     _refuse_other_version(cell)
     if is_checked and scope.is_user:
-        message = "cannot check the boot with a dataflow of a user"
-        raise DoraSystemdError(message, "use --system", ExitCode.USAGE)
+        raise usage_error("cannot check the boot with a dataflow of a user", "use --system")
     boot = read_boot_unit(manager, scope, cell.unit)
     if boot.can_start and (boot.is_checked or not is_checked):
         return boot, False

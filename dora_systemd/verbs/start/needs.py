@@ -19,7 +19,7 @@ from dora_systemd.decisions.needs.units import (
 from dora_systemd.decisions.needs.waiting import START, WAITS, format_wait
 from dora_systemd.decisions.needs.words import CLOCK, DATAFLOW, MOUNT, NET, NETWORK, NodeNeed
 from dora_systemd.decisions.properties.sandbox import Sandbox
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import name_from_unit, unit_name
 from dora_systemd.values import shown
 
@@ -112,8 +112,7 @@ def _escaped_byte(byte: int) -> str:
 
 
 def _refusal(plan: Needy, need: str, reason: str, hint: str) -> DoraSystemdError:
-    message = f"cannot start {plan.name}: it needs {need}: {reason}"
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    return bad_input(f"cannot start {plan.name}: it needs {need}: {reason}", hint)
 
 
 def clock_service() -> str:

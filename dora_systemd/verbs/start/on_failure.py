@@ -7,7 +7,7 @@ from pathlib import Path
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.notice.command import Words, is_command, unit_of, words_of
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import bad_input
 from dora_systemd.names import notice_unit
 from dora_systemd.scope import Scope
 from dora_systemd.trust.sight import Sight
@@ -32,9 +32,8 @@ def find_command(
     places = (f"{one}/{path}" for one in search_path.split(os.pathsep) if one.startswith("/"))
     found = next(filter(sight.is_program, places), "")
     if not found:
-        hint = "install it, or write its path"
         message = f"cannot use {quoted(path)} as on_failure: no such program on PATH"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(message, "install it, or write its path")
     return (found, *words[1:])
 
 
@@ -52,5 +51,4 @@ def check_units(manager: Manager, scope: Scope, options: RunnerOptions) -> None:
 def _check_unit(manager: Manager, unit: str, hint: str, key: str = "on_failure") -> None:
     state = str(manager.read(unit, ["LoadState"])["LoadState"])
     if state != "loaded":
-        message = f"cannot use {key}: unit {unit} is {state}"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(f"cannot use {key}: unit {unit} is {state}", hint)

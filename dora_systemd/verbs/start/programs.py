@@ -13,7 +13,7 @@ from pathlib import Path, PurePath
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import OLDEST_DORA, version_numbers
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sight import Sight, sight_of
 from dora_systemd.values import shown
@@ -91,8 +91,7 @@ def _check_machine(path: str, real: str, head: bytes, here: str) -> None:
     if is_for(machine, this) or (not here and _has_emulators()):
         return
     reason = f"{_leads(path, real)} is a program for {machine}, and this machine is {this}"
-    hint = f"{_again(path)} on this machine"
-    raise DoraSystemdError(f"cannot use {shown(path)}: {reason}", hint, ExitCode.BAD_INPUT)
+    raise bad_input(f"cannot use {shown(path)}: {reason}", f"{_again(path)} on this machine")
 
 
 def _has_emulators() -> bool:
@@ -203,7 +202,7 @@ def version_trouble(venv: str | None, dora: str, sight: Sight) -> tuple[str, str
     if version_numbers(version) < OLDEST_DORA:
         message = f"cannot start nodes with the Python of {shown(venv)}: their dora is "
         message += f"{version}, 1.0 or newer is needed"
-        raise DoraSystemdError(message, f"{install} --upgrade dora-rs", ExitCode.BAD_INPUT)
+        raise bad_input(message, f"{install} --upgrade dora-rs")
     daemon = daemon_dora(dora, sight)
     if daemon in ("", version):
         return "", ""

@@ -14,7 +14,7 @@ from typing import Any
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import release_of, settings_path
 from dora_systemd.scope import Scope, config_home
 from dora_systemd.trust.files import Text, read_file, unreadable
@@ -87,9 +87,8 @@ def _refuse_release(path: Path) -> None:
     Such a file is owned by root, but not written by root, who must not trust its settings.
     """
     if release := release_of(str(path)):
-        hint = f"doractl rollback NAME {release} runs that release"
         message = f"cannot start {path}: it belongs to a release"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise bad_input(message, f"doractl rollback NAME {release} runs that release")
 
 
 def read_beside(dataflow: Path, origin: Place | None = None) -> SettingsFile | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dora_systemd.decisions.cell.machines import Placed
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import bad_input
 from dora_systemd.names import name_from_path, parse_name
 from dora_systemd.trust.paths import Place
 from dora_systemd.values import shown
@@ -51,13 +51,12 @@ def request_name(request: StartRequest) -> str:
 def path_of(request: StartRequest) -> Path:
     """Return the absolute path of the request. Raises DoraSystemdError (BAD_INPUT) if empty."""
     if not request.dataflow:  # not the working directory: a variable of a script is not set
-        raise DoraSystemdError("cannot read '': no path", "name a file", ExitCode.BAD_INPUT)
+        raise bad_input("cannot read '': no path", "name a file")
     try:
         return Path(request.dataflow).absolute()
     except FileNotFoundError as error:
         message = f"cannot read {shown(request.dataflow)}: the current directory was removed"
-        hint = "cd to a directory that exists"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT) from error
+        raise bad_input(message, "cd to a directory that exists") from error
 
 
 def current_directory() -> Path:

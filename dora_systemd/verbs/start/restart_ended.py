@@ -15,7 +15,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.decisions.logs.journal_events import FORGOTTEN
 from dora_systemd.decisions.settings.resolve import given_texts, is_given
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import is_name, is_uuid, is_uuid_prefix, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists, is_directory
@@ -53,9 +53,8 @@ class Asked:
         Raises DoraSystemdError (USAGE) for another name.
         """
         if wanted.name not in (None, self.name):
-            message = f"cannot start {self.name} as {quoted(wanted.name)}"
             hint = f"doractl start {self.dataflow} --name NAME starts one more"
-            raise DoraSystemdError(message, hint, ExitCode.USAGE)
+            raise usage_error(f"cannot start {self.name} as {quoted(wanted.name)}", hint)
         given = {key: value for key, value in wanted.flags.items() if is_given(value)}
         flags = {**self.flags, **given}
         return replace(wanted, dataflow=self.dataflow, name=self.name, flags=flags, uuid=self.uuid)

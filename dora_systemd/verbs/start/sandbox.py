@@ -22,7 +22,7 @@ from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.sandbox import NETWORK, SANDBOX, WRITABLE
 from dora_systemd.decisions.settings.table import PROPERTY
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import bad_input
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import firm_part
 from dora_systemd.trust.programs import account_from
@@ -143,10 +143,9 @@ def _checked(path: str, sight: Sight, user: pwd.struct_passwd | None) -> str:
     absolute = str(Path(path).absolute())
     if not sight.exists(absolute):
         make = "mkdir -p" if user is None else f"install -d -o {user.pw_name}"
-        raise DoraSystemdError(
+        raise bad_input(
             f"cannot let the nodes write {shown(absolute)}: there is no such file",
             f"{make} {shlex.quote(absolute)}, or correct --writable",
-            ExitCode.BAD_INPUT,
         )
     return absolute_path(absolute)
 

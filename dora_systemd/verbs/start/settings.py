@@ -9,7 +9,7 @@ from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.stops import STOP_LIMIT
 from dora_systemd.decisions.settings.table import ENV_FILE, GRACE_DURATION, NODES, SETTINGS
-from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey
+from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey, bad_input
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import hint_of_changeable
 from dora_systemd.values import INFINITY, as_mapping, format_duration, shown
@@ -122,7 +122,7 @@ def _check_grace(settings: Settings, read: SettingsFile) -> None:
         f" and stop_limit is {format_duration(limit)}"
     )
     hint = f"lower it, or root raises {STOP_LIMIT.flags[0]} or stop_limit in {SYSTEM_FILE}"
-    raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    raise bad_input(message, hint)
 
 
 def _untrusted(read: SettingsFile, key: str, flag: str) -> DoraSystemdError:

@@ -24,7 +24,7 @@ from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.decisions.settings.resolve import Settings, with_settings
 from dora_systemd.decisions.settings.table import DORA, ENV, ENV_FILE, VENV, WORKING_DIRECTORY
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import unreadable
 from dora_systemd.trust.paths import Place, reached, user_name
@@ -100,10 +100,9 @@ class Look:
     def _checked_venv(self, venv: str) -> str:
         if not self._is_venv(venv):
             self._blame(VENV, f"{venv}/bin/python", _OWN.exists(f"{venv}/bin/python"))
-            raise DoraSystemdError(
+            raise bad_input(
                 f"cannot use {venv} as virtual environment: it has no bin/python",
                 f"python3 -m venv {venv}",
-                ExitCode.BAD_INPUT,
             )
         return self._usable([venv], is_unbuilt=False) or venv
 
@@ -262,10 +261,9 @@ def choose_user(
     """
     if scope.is_user:
         if wanted is not None:
-            raise DoraSystemdError(
+            raise usage_error(
                 "cannot choose the user of a dataflow with --user",
                 "leave --uid out, or use --system as root",
-                ExitCode.USAGE,
             )
         return None
     if wanted is not None:
@@ -283,7 +281,7 @@ def choose_user(
 def no_directory(directory: str) -> DoraSystemdError:
     """Return the error for a working directory that is no directory."""
     message = f"cannot use {shown(directory)} as working directory: it is not a directory"
-    return DoraSystemdError(message, "correct --working-directory", ExitCode.BAD_INPUT)
+    return bad_input(message, "correct --working-directory")
 
 
 def account_of(user: pwd.struct_passwd | None) -> Account | None:
@@ -305,17 +303,14 @@ def check_identity(dataflow: Place, directory: Place) -> None:
     if directory.is_open:
         reason = reason or f"everybody can write in {shown(directory.path)}"
     if reason:
-        raise DoraSystemdError(
+        raise bad_input(
             f"cannot choose a user by the owner of {shown(dataflow.path)}: {reason}",
             "choose one with --uid USER",
-            ExitCode.BAD_INPUT,
         )
 
 
 def _entry(wanted: str) -> pwd.struct_passwd:
-    refusal = DoraSystemdError(
-        f"cannot find a user {quoted(wanted)}", "see getent passwd", ExitCode.USAGE
-    )
+    refusal = usage_error(f"cannot find a user {quoted(wanted)}", "see getent passwd")
     is_number = wanted.isascii() and wanted.isdigit() and len(wanted) <= _MOST_DIGITS
     return _known(int(wanted) if is_number else wanted, refusal)
 
@@ -323,13 +318,13 @@ def _entry(wanted: str) -> pwd.struct_passwd:
 def _owner_entry(owner: int, dataflow: str) -> pwd.struct_passwd:
     message = f"cannot choose a user: the owner of {dataflow} is {owner}, which has no name"
     hint = "choose one with --uid USER"
-    return _known(owner, DoraSystemdError(message, hint, ExitCode.BAD_INPUT))
+    return _known(owner, bad_input(message, hint))
 
 
 def _default_entry() -> pwd.struct_passwd:
     message = f"cannot choose a user: the dataflow is root's and there is no user {DEFAULT_USER}"
     hint = f"choose one with --uid USER, or make it: useradd --system {DEFAULT_USER}"
-    return _known(DEFAULT_USER, DoraSystemdError(message, hint, ExitCode.BAD_INPUT))
+    return _known(DEFAULT_USER, bad_input(message, hint))
 
 
 def _known(user: int | str, refusal: DoraSystemdError) -> pwd.struct_passwd:
