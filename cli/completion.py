@@ -24,6 +24,7 @@ from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.decisions.reload.swap_order import REPLACE_WORDS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_uuid_prefix
+from dora_systemd.scope import Scope
 
 VARIABLE = "_DORACTL_COMPLETE"
 
@@ -79,11 +80,6 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
     return [name for name in dict.fromkeys(names) if name not in given]
 
 
-def user_names(_ctx: click.Context, _incomplete: str) -> list[str]:
-    """The users of this machine."""
-    return [one.pw_name for one in pwd.getpwall()]
-
-
 def host_names(_ctx: click.Context, incomplete: str) -> list[str]:
     """Complete a list of hosts: every host of the hosts file, after the text before it."""
     from dora_systemd.verbs.remote.hosts import listed_hosts
@@ -117,16 +113,17 @@ def release_ids(ctx: click.Context, _incomplete: str) -> list[str]:
     """The releases of the dataflow that is on the command line."""
     from dora_systemd.verbs.releases.listing import store_of
 
-    name = ctx.params.get("selector") or next(iter(ctx.args), "")
-    if is_elsewhere() or not is_name(name):
-        return []
-    return [one.id for one in store_of(current_scope(), name).known()]
+    return _known_ids(ctx, store_of)
 
 
 def bundle_names(ctx: click.Context, _incomplete: str) -> list[str]:
     """The bundles of the dataflow that is on the command line."""
     from dora_systemd.verbs.bundles.listing import store_of
 
+    return _known_ids(ctx, store_of)
+
+
+def _known_ids(ctx: click.Context, store_of: Callable[[Scope, str], Any]) -> list[str]:
     name = ctx.params.get("selector") or next(iter(ctx.args), "")
     if is_elsewhere() or not is_name(name):
         return []
@@ -151,7 +148,7 @@ TYPES: dict[str, Any] = {
     "device": click.File(),
     "file": click.File(),
     "bundle": Live(bundle_names),
-    "user": Live(user_names),
+    "user": Live(lambda *_: [one.pw_name for one in pwd.getpwall()]),
     "host": Live(host_names),
     "restart_policy": click.Choice(POLICIES),
     "replace": click.Choice(REPLACE_WORDS),

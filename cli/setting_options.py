@@ -9,7 +9,7 @@ import click
 
 from dora_systemd.cli.parameters import HELP_ALL, wants_all
 from dora_systemd.decisions.settings.kinds import Setting
-from dora_systemd.decisions.settings.table import CHANGEABLE, SECTIONS, SETTINGS
+from dora_systemd.decisions.settings.table import SECTIONS, SETTINGS
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -90,11 +90,6 @@ class SettingsCommand(click.Command):
 def setting_options(function: F) -> F:
     """Add all flags of settings, whose raw values become arguments with the setting's name."""
     return options_of(SETTINGS, function)
-
-
-def live_options(function: F) -> F:
-    """The flags of settings that can be changed while a dataflow is running."""
-    return options_of(CHANGEABLE, function)
 
 
 def options_of(settings: Sequence[Setting[Any]], function: F) -> F:

@@ -85,6 +85,9 @@ class Whole:
         """Return the whole output of a host, and discard it."""
         return self.texts.pop(host, bytearray()).decode("utf-8", "replace")
 
+    def finish(self) -> None:
+        """Nothing: all is printed."""
+
 
 class BlockPrinter(Whole):
     """The whole text of a host, below its name, as head(1) and tail(1) do with files."""
@@ -107,9 +110,6 @@ class BlockPrinter(Whole):
         if text := self.take(host).rstrip("\n"):
             click.echo(f"{self._gap}==> {host.text} <==\n{text}")
             self._gap = "\n"
-
-    def finish(self) -> None:
-        """Nothing: all is printed."""
 
 
 class JsonPrinter(Whole):

@@ -1,6 +1,7 @@
 """Change limits or hot reload of a running dataflow."""
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import click
@@ -12,8 +13,9 @@ from dora_systemd.cli.parameters import (
     print_outcomes,
     print_warnings,
 )
-from dora_systemd.cli.setting_options import live_options
+from dora_systemd.cli.setting_options import options_of
 from dora_systemd.decisions.settings.resolve import is_given
+from dora_systemd.decisions.settings.table import CHANGEABLE
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -26,7 +28,7 @@ from dora_systemd.verbs.set import set_limits
 
 @click.command("set")
 @click.argument("selector")
-@live_options
+@partial(options_of, CHANGEABLE)
 @click.option("--hot-reload", type=click.Choice(["on", "off"]), help="Turn hot reload on or off.")
 @click.option(
     "--record",

@@ -63,7 +63,7 @@ def _open(scope: Scope, address: str, seconds: float, patience: float) -> Any:
 
     # A manager's private socket is not a bus, so there is no Hello call.
     is_private = address.endswith("/private")
-    with connection_error(scope), ExitStack() as undo:
+    with _translated(lambda error: _unreachable(scope, error)), ExitStack() as undo:
         bus = dbuslib.DBusAddress(f"unix:path={address}".encode(), peer_to_peer=is_private)
         with _deadline(seconds):
             bus.open()  # calls Hello
@@ -171,11 +171,6 @@ def explained(action: str, scope: Scope) -> AbstractContextManager[None]:
     return _translated(
         lambda error: bus_error(action, scope, error_name(error), _told(error, "err_message"))
     )
-
-
-def connection_error(scope: Scope) -> AbstractContextManager[None]:
-    """Explain why a manager cannot be reached at all, with a hint."""
-    return _translated(lambda error: _unreachable(scope, error))
 
 
 @contextmanager

@@ -110,15 +110,12 @@ def owes_of(options: RunnerOptions) -> tuple[Owed, ...]:
     return tuple(one._replace(node=node) for node, own in owes.items() for one in own)
 
 
-def owes_restart(owes: Iterable[Owed], node: str) -> bool:
-    """Whether `node` is restarted if it is silent."""
-    return any(one.node == node and one.then == RESTART for one in owes)
-
-
 def base_of(policy: RestartPolicy, owes: Iterable[Owed], node: str) -> RestartPolicy:
     """The policy of a node without one of its own, from that of the dataflow."""
-    is_needed = policy.policy == "no" and owes_restart(owes, node)
-    return policy._replace(policy="on-failure") if is_needed else policy
+    owes_restart = any(one.node == node and one.then == RESTART for one in owes)
+    return (
+        policy._replace(policy="on-failure") if policy.policy == "no" and owes_restart else policy
+    )
 
 
 @lru_cache(maxsize=4)

@@ -100,12 +100,8 @@ def _is_own(one: Happening, uuid: str, begin: int) -> bool:
 def own_lives(happenings: Iterable[Happening], uuid: str) -> list[Life]:
     """The lives of the dataflow `uuid`, without earlier ones of another dataflow of that name."""
     lives = find_lives(one for one in happenings if one.name not in OUTSIDE)
-    places = (place for place, life in enumerate(lives) if _names(life, uuid))
+    places = (place for place, life in enumerate(lives) if life.is_of(uuid))
     return lives[next(places, len(lives)) :]
-
-
-def _names(life: Life, uuid: str) -> bool:
-    return any(one.detail("dataflow") == uuid for one in life.happenings)
 
 
 def _life(life: Life, now: Now, use: Use) -> dict[str, Any]:

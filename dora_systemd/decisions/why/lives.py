@@ -76,6 +76,10 @@ class Life:
         """The first record with one of these names."""
         return next(iter(self.all(*names)), None)
 
+    def is_of(self, uuid: str) -> bool:
+        """Whether a record names the dataflow with that UUID."""
+        return any(one.detail("dataflow") == uuid for one in self.happenings)
+
     @property
     def began_us(self) -> int:
         """CLOCK_REALTIME µs of its beginning, 0 if that is not recorded."""

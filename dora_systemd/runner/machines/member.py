@@ -64,10 +64,6 @@ if TYPE_CHECKING:
 _LONGEST = 100
 
 
-async def _connection_of(boot: MemberBoot) -> Ends:
-    return await taken_over(boot.connection, boot.rest, wire.MAX_LINE)
-
-
 class Uses:
     """Reads the groups of the nodes as often as the runner samples them, and at each new stage.
 
@@ -111,7 +107,9 @@ class Member(Shared):
         options: RunnerOptions,
         this_life: Life,
         boot: EarlyDaemon | None,
-        take_over: Callable[[MemberBoot], Awaitable[Ends]] = _connection_of,
+        take_over: Callable[[MemberBoot], Awaitable[Ends]] = lambda boot: taken_over(
+            boot.connection, boot.rest, wire.MAX_LINE
+        ),
     ) -> None:
         # The head decides which failure ends the dataflow: its members only report them.
         super().__init__(options.without("owes", "essential"), this_life)

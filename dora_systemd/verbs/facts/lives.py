@@ -20,14 +20,10 @@ def read_lives(
     records = islice(journal.newest(matches, None, is_whole=True), _MOST_RECORDS)
     found = [one for one in map(parse_happening, records) if one is not None]
     lives = find_lives(reversed(found))
-    own = [place for place, life in enumerate(lives) if _is_of(life, uuid)]
+    own = [place for place, life in enumerate(lives) if life.is_of(uuid)]
     # A life that failed before our code ran has no UUID: it belongs to the loaded dataflow.
     begin = own[0] if own else -1
     return lives[begin:] if is_loaded else lives[begin : own[-1] + 1 if own else 0]
-
-
-def _is_of(life: Life, uuid: str) -> bool:
-    return any(one.detail("dataflow") == uuid for one in life.happenings)
 
 
 def now_boot() -> str:

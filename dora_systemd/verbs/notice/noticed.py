@@ -34,11 +34,6 @@ class Noticed(NamedTuple):
         box: BlackBox | None = self.cell.options.of_dataflow("black_box")
         return box
 
-    @property
-    def has_command(self) -> bool:
-        """Whether it has the setting on_failure."""
-        return self.cell.options.has("on_failure")
-
 
 def read_noticed(manager: Manager, name: str) -> Noticed | None:
     """Read the dataflow `name`; None if systemd does not know it, or it has no such setting.

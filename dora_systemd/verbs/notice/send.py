@@ -69,7 +69,7 @@ class Sender:
         if noticed.box:
             self._write_bundle(noticed.cell, noticed.box, happened, pause_us)
             self._memory.close_ring()
-        if not noticed.has_command:
+        if not noticed.cell.options.has("on_failure"):
             return None
         node = self._write_report(noticed.cell, happened)
         try:

@@ -148,11 +148,6 @@ def _barrier(path: str, sight: Sight) -> str:
     return next((one for one in parents if sight.exists(one)), "/")
 
 
-def nodes_dora(venv: str, sight: Sight) -> str:
-    """The version of dora that Python nodes of a virtual environment import, or ""."""
-    return _wheel(venv, "dora_rs", sight)
-
-
 def daemon_dora(dora: str, sight: Sight) -> str:
     """The version of a dora command, without running it, or ""."""
     places = (str(PurePath(one).parent.parent) for one in (dora, sight.real(dora)))
@@ -194,7 +189,7 @@ def version_trouble(venv: str | None, dora: str, sight: Sight) -> tuple[str, str
 
     venv: of the nodes. Raises DoraSystemdError (BAD_INPUT) for a dora that no daemon takes.
     """
-    version = nodes_dora(venv, sight) if venv else ""
+    version = _wheel(venv, "dora_rs", sight) if venv else ""
     if not version or not venv:
         return "", ""
     has_pip = sight.exists(f"{venv}/bin/pip")  # uv's have none
