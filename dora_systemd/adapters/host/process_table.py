@@ -10,9 +10,10 @@ from collections import defaultdict
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from dora_systemd.decisions.views.diagnosis import Process
+if TYPE_CHECKING:
+    from dora_systemd.decisions.views.diagnosis import Process
 
 PROC = Path("/proc")
 
@@ -24,7 +25,7 @@ _MOST_OF_PROCESS = 4096
 _FLOCK = re.compile(rb"\d+: FLOCK +\S+ +(?:READ|WRITE) +(\d+) ([0-9a-f]+:[0-9a-f]+):(\d+) ")
 
 
-def read_processes(proc: Path = PROC) -> list[Process]:
+def read_processes(proc: Path = PROC) -> "list[Process]":
     """Read all readable processes, without kernel threads."""
     found = (_read_process(path) for path in proc.glob("[0-9]*"))
     return sorted((one for one in found if one), key=lambda one: one.pid)
@@ -53,7 +54,9 @@ def socket_owners(inodes: Collection[int], proc: Path = PROC) -> frozenset[int]:
     return frozenset(int(path.parent.name) for path in paths if _holds(path, inodes))
 
 
-def _read_process(path: Path) -> Process | None:
+def _read_process(path: Path) -> "Process | None":
+    from dora_systemd.decisions.views.diagnosis import Process
+
     try:
         command = beginning(path / "cmdline").decode(errors="replace").split("\0")[:-1]
         parent = int(_status_fields(path)[1])

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.decisions.logs.journal_events import FORGOTTEN
-from dora_systemd.decisions.settings.resolve import given_texts, is_given
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import is_name, is_uuid, is_uuid_prefix, unit_name
 from dora_systemd.scope import Scope
@@ -52,6 +51,8 @@ class Asked:
 
         Raises DoraSystemdError (USAGE) for another name.
         """
+        from dora_systemd.decisions.settings.resolve import is_given
+
         if wanted.name not in (None, self.name):
             hint = f"doractl start {self.dataflow} --name NAME starts one more"
             raise usage_error(f"cannot start {self.name} as {quoted(wanted.name)}", hint)
@@ -70,6 +71,8 @@ def means_name(text: str) -> bool:
 
 def note_start(plan: "Plan", request: "StartRequest", command: str) -> None:
     """Write the request of a start to the journal. command: such as "doractl start"."""
+    from dora_systemd.decisions.settings.resolve import given_texts
+
     options = plan.options
     note_request(
         EVENT,

@@ -34,8 +34,14 @@ LATE = {
     "it has all properties, and verbs that read processes judge no systemd": {
         "decisions.views.diagnosis": {"decisions.unit.systemd_versions"},
     },
-    "only a start by name, of what has ended, reads the journal": {
-        "verbs.start.restart_ended": {"adapters.journal.reader", "decisions.logs.query"},
+    "only doctor, up and destroy list processes": {
+        "adapters.host.process_table": {"decisions.views.diagnosis"},
+    },
+    "a restart of what runs resolves no settings, and does not read the journal": {
+        "verbs.start.restart_ended": {
+            *("adapters.journal.reader", "decisions.logs.query"),
+            "decisions.settings.resolve",
+        },
     },
     "only some verbs wrap, and only on a terminal": {
         "terminal_text": {"textwrap"},
