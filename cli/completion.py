@@ -21,7 +21,7 @@ from dora_systemd.cli.group import SHOWN, VerbGroup, doractl
 from dora_systemd.cli.parameters import current_scope, is_elsewhere
 from dora_systemd.decisions.cell.restarts import POLICIES
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
-from dora_systemd.decisions.reload.swap_order import REPLACE_WORDS
+from dora_systemd.decisions.settings.reload import REPLACE_WORDS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_uuid_prefix
 from dora_systemd.scope import Scope

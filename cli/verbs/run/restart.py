@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from functools import partial
 
 import click
@@ -17,6 +18,9 @@ from dora_systemd.cli.parameters import (
     tell,
 )
 from dora_systemd.cli.terminal import StageLine
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import refuse_parts
 from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.restart import restart_cells
@@ -58,7 +62,27 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
     done = [cell for cell, one in zip(cells, outcomes, strict=False) if not one.problem]
     print_warnings(version_warnings(bus, done))
     if any(one.problem for one in outcomes):
-        from dora_systemd.cli.last_words import with_last_words
-
         return print_outcomes(with_last_words(bus, scope, one) for one in outcomes)
     return print_outcomes(outcomes)
+
+
+def print_last_words(bus: Bus, scope: Scope, uuid: str, error: DoraSystemdError) -> str:
+    """Print the lines before the error of a start; the hint for the error."""
+    if error.code is not ExitCode.FAILURE:
+        return error.hint
+    # Imported late: most starts succeed.
+    from dora_systemd.decisions.why.remedies import known_remedy
+    from dora_systemd.verbs.why import words_of_start
+
+    words = words_of_start(bus, scope, uuid)
+    for line in words:
+        tell(f"  {line}", err=True)
+    return known_remedy(words) or error.hint
+
+
+def with_last_words(bus: Bus, scope: Scope, outcome: Outcome) -> Outcome:
+    """The outcome of a restart; if it has failed, print the lines before it."""
+    if outcome.error is None:
+        return outcome
+    hint = print_last_words(bus, scope, outcome.subject.uuid, outcome.error)
+    return replace(outcome, hint=hint)

@@ -206,7 +206,7 @@ def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
     try:
         yield
     except DoraSystemdError as error:
-        from dora_systemd.cli.last_words import print_last_words
+        from dora_systemd.cli.verbs.run.restart import print_last_words
 
         hint = print_last_words(bus, scope, uuid, error)
         raise DoraSystemdError(error.message, hint, error.code) from error

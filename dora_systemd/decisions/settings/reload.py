@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from dora_systemd.decisions.reload.swap_order import REPLACE_WORDS
 from dora_systemd.decisions.reload.watch_rules import (
     DEFAULT_WATCH,
     parse_patterns,
@@ -11,6 +10,10 @@ from dora_systemd.decisions.reload.watch_rules import (
 from dora_systemd.decisions.settings.kinds import BOOL, Setting, many_texts, one_text
 from dora_systemd.errors import usage_error
 from dora_systemd.values import quoted
+
+START_FIRST = "start-first"
+REPLACE_WORDS = ("stop-first", START_FIRST)
+"""What is first when a node gets another process: the end of the old one, or the start."""
 
 
 def _parse_replace(text: str) -> str:

@@ -18,7 +18,7 @@ from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.life.view import has_started
 from dora_systemd.decisions.reload.changes import How, Step, has_readers
-from dora_systemd.decisions.reload.swap_order import START_FIRST
+from dora_systemd.decisions.settings.reload import START_FIRST
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.reload.sources import Change, Versions

@@ -24,7 +24,7 @@ from dora_systemd.names import notice_unit, unit_name
 from dora_systemd.paths import LAST_REQUEST
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists
-from dora_systemd.trust.requests import clear_directory
+from dora_systemd.trust.tree import clear_directory
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.lives import now_boot
 

@@ -310,7 +310,7 @@ def wait_until_forgotten(manager: Manager, unit: str, most: float = _FORGET_SECO
 
 
 def _is_held(manager: Manager, unit: str) -> bool:
-    """Whether the unit waits for the service that reports its failure, see noticed.py."""
+    """Whether the unit waits for the service that reports its failure, see verbs/notice/."""
     hold = notice_hold_unit(name_from_unit(unit) or "")
     return bool(queued_job(manager.read(hold, ["Job"])))
 

@@ -22,8 +22,7 @@ LATE = {
         },
     },
     "most notices come without a bundle, which needs all that doctor checks": {
-        "verbs.notice.noticed": {"verbs.bundles.recording"},
-        "verbs.notice.send": {"verbs.bundles.write"},
+        "verbs.notice.send": {"verbs.bundles.recording", "verbs.bundles.write"},
     },
     "a report of what this machine knows reads no bundle": {
         "cli.verbs.look.why": {"verbs.bundles.listing"},
@@ -61,14 +60,14 @@ LATE = {
     },
     "a start that succeeds has no last words, most follow no log and copy no files": {
         "cli.verbs.run.start": {
-            *("cli.foreground", "cli.last_words", "verbs.start.run", "verbs.machines.push"),
+            *("cli.foreground", "cli.verbs.run.restart", "verbs.start.run", "verbs.machines.push"),
         },
     },
     "it reads projects: most verbs for other hosts do not": {
         "cli.remote.dispatch": {"cli.remote.rollout"},
     },
     "a restart of what runs makes no plan": {
-        "cli.verbs.run.restart": {"cli.last_words", "verbs.start.start"},
+        "cli.verbs.run.restart": {"decisions.why.remedies", "verbs.start.start", "verbs.why"},
     },
     "only a wrong command line needs a similar command, or the names of dataflows": {
         "cli.group": {"difflib", "adapters.bus.systemd", "verbs.facts.cells"},

@@ -45,7 +45,7 @@ OTHERWISE = (
 _TABLE = {
     DOOR: """
         trust.courier trust.eyes trust.files trust.locks trust.owned trust.paths
-        trust.project trust.programs trust.requests trust.rings trust.scribe
+        trust.project trust.programs trust.rings trust.scribe
         trust.sight trust.sockets trust.terminals trust.tree
     """,
     OWN: """

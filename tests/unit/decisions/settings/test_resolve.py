@@ -13,10 +13,10 @@ from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.decisions.recorder.record import Record
-from dora_systemd.decisions.reload.swap_order import REPLACE_WORDS
 from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
 from dora_systemd.decisions.settings.machines import Declared
 from dora_systemd.decisions.settings.nodes import nodes_setting
+from dora_systemd.decisions.settings.reload import REPLACE_WORDS
 from dora_systemd.decisions.settings.resolve import (
     DEFAULT_SOURCE,
     Settings,

@@ -8,7 +8,7 @@ import pytest
 
 from dora_systemd.decisions.notice.happened import Happened, Sent, Story
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.trust.requests import clear_directory
+from dora_systemd.trust.tree import clear_directory
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.notice.dispatch import Dispatcher
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
