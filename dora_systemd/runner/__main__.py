@@ -51,10 +51,11 @@ def begin(argv: list[str]) -> "Begun | None":
             if options.placed:
                 return begin_shared(options, paths, unit, environment)
             coordinator = start_coordinator(options.dora, paths, environment)
-            from dora_systemd.adapters.dora.check import DoraCheck
             from dora_systemd.runner.cell.boot import Boot
 
             boot = Boot(coordinator, options, paths, unit, environment)
+            from dora_systemd.adapters.dora.check import DoraCheck
+
             return boot, DoraCheck(options, environment, boot.listens)
     return None
 

@@ -9,9 +9,8 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 
@@ -53,15 +52,14 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-@dataclass(frozen=True)
-class Child:
+class Child(NamedTuple):
     """One child process."""
 
     label: str
     popen: "subprocess.Popen[bytes]"
     pidfd: int
     output: int  # read end of its stdout and stderr
-    said: bytearray = field(default_factory=bytearray)  # the output so far
+    said: bytearray  # the output so far
 
     def send_signal(self, number: signal.Signals) -> None:
         """Send the child a signal, but never another process that has reused its pid."""
@@ -98,7 +96,7 @@ def spawn(
         raise
     finally:
         os.close(writing)
-    return Child(label, popen, os.pidfd_open(popen.pid), reading)
+    return Child(label, popen, os.pidfd_open(popen.pid), reading, bytearray())
 
 
 def read_port(coordinator: Child, seconds: float) -> int:

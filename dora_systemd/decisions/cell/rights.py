@@ -9,8 +9,8 @@ again, to the value of the unit, which the kernel keeps for all children.
 
 import re
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -160,14 +160,13 @@ BEHIND_ESSENTIAL = 500
 _PROGRAMS = "/usr/bin"
 
 
-@dataclass(frozen=True)
-class Base:
+class Base(NamedTuple):
     """The rights of all processes of the unit: nice value, OOM score adjustment."""
 
     nice: int = 0
     oom: int = 0
     # by node, the list of its CPUs, unless a cgroup keeps the node there
-    bound: Mapping[str, str] = field(default_factory=dict)
+    bound: Mapping[str, str] = MappingProxyType({})
 
 
 def rights_commands(rights: Sequence[NodeRights], base: Base) -> dict[str, list[str]]:

@@ -272,6 +272,11 @@ def test_runners_load_little(tmp_path: Path) -> None:
     assert not (loaded_by(code, tmp_path) - before) & NOT_IN_RUNNERS
 
 
+def test_a_coordinator_waits_for_no_slow_module(tmp_path: Path) -> None:
+    loaded = loaded_by("import dora_systemd.runner.__main__", tmp_path) - loaded_by("", tmp_path)
+    assert not loaded & {"dataclasses", "inspect", "asyncio", "logging", "yaml"}
+
+
 STARTS_PROGRAMS = {
     "trust.programs": "for others",
     "adapters.dora.engine": "dora's, in a cell",
