@@ -182,8 +182,7 @@ def cannot_reach(user: str, path: str) -> DoraSystemdError:
     """The error for a path that the user of a dataflow cannot access."""
     message = f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}"
     way = "move it, chmod a+rX what is closed, or choose another user with --uid"
-    hint = f"see namei -l {shown(path)}: {way}"
-    return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
+    return DoraSystemdError(message, f"see namei -l {shown(path)}: {way}", ExitCode.NO_PERMISSION)
 
 
 def send(fd: int, data: bytes, deadline: float) -> None:

@@ -256,8 +256,7 @@ def plain(text: str) -> str:
 
 def _check_owner(path: Path, found: int, expected: int) -> None:
     if found != expected:
-        reason = f"it is {user_name(found)}'s, its directory {user_name(expected)}'s"
-        raise _refusal(path, reason)
+        raise _refusal(path, f"it is {user_name(found)}'s, its directory {user_name(expected)}'s")
 
 
 def _refusal(path: Path, reason: str) -> DoraSystemdError:

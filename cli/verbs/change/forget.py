@@ -41,8 +41,7 @@ def command(selector: str, releases: tuple[str, ...], force: bool) -> int:
 
 
 def _removed(kept: Kept, release: str) -> Outcome:
-    text = f"Release removed: {release} ({kept.name})"
-    return Outcome(kept, text, details={"release": release})
+    return Outcome(kept, f"Release removed: {release} ({kept.name})", details={"release": release})
 
 
 def _agrees(kept: Kept) -> bool:

@@ -126,9 +126,8 @@ class Bus:
     def thaw(self, unit: str) -> bool:
         state = self._read_one(unit, "FreezerState")
         if state in _BY_PARENT:
-            message = f"cannot use {unit}: a slice that contains it is frozen"
             hint = f"run: systemctl {self.scope.flag} thaw {self._read_one(unit, 'Slice')}"
-            raise DoraSystemdError(message, hint)
+            raise DoraSystemdError(f"cannot use {unit}: a slice that contains it is frozen", hint)
         is_frozen = state in _FROZEN
         if is_frozen:
             self._call(f"thaw {unit}", "ThawUnit", ("s", unit))

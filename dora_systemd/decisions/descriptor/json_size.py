@@ -62,8 +62,7 @@ def _text_size(value: str, source: str) -> int:
     try:
         return len(value.encode()) + 4
     except UnicodeEncodeError as error:
-        hint = "save the file as UTF-8"
-        raise refusal(source, "a text in it is not Unicode", hint) from error
+        raise refusal(source, "a text in it is not Unicode", "save the file as UTF-8") from error
 
 
 def _children(value: object, source: str) -> Iterator[object]:

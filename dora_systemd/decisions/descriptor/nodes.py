@@ -131,8 +131,7 @@ def _kind_of(node: Mapping[str, object], source: str, what: str) -> NodeKind:
         kinds = ("path", *_KEY_KINDS)
         near = (did_you_mean(key, kinds) for key in node if key not in kinds)
         hint = "a node needs one of path, operator, operators, ros2, module and hub"
-        hint = next(filter(None, near), hint)
-        raise refusal(source, f"{what} has no path", hint)
+        raise refusal(source, f"{what} has no path", next(filter(None, near), hint))
     if path in _PATH_KINDS:
         return _PATH_KINDS[path]
     if path.startswith(("http://", "https://")):
@@ -182,8 +181,7 @@ def mapping_of(value: object, source: str, what: str) -> Mapping[str, object]:
     what: its name in the error.
     """
     if value is not None and not isinstance(value, dict):
-        hint = "write a mapping, KEY: VALUE"
-        raise refusal(source, f"{what} is {described(value)}", hint)
+        raise refusal(source, f"{what} is {described(value)}", "write a mapping, KEY: VALUE")
     return value or {}
 
 

@@ -305,5 +305,4 @@ def _check_ports(*ports: int) -> None:
 
 def _unreadable() -> DoraSystemdError:
     hint = "both machines need the same version of dora-systemd"
-    message = "cannot read what the other machine says"
-    return DoraSystemdError(message, hint, ExitCode.FAILURE)
+    return DoraSystemdError("cannot read what the other machine says", hint, ExitCode.FAILURE)

@@ -144,8 +144,7 @@ def check_document(
     if document is None:
         return {}
     if not isinstance(document, dict):
-        hint = "a settings file is a mapping, KEY: VALUE"
-        raise refusal(source, "it is not a mapping", hint)
+        raise refusal(source, "it is not a mapping", "a settings file is a mapping, KEY: VALUE")
     check_json(document, source, MAX_JSON)
     try:
         validate_settings(document, table)

@@ -112,8 +112,7 @@ def judge_journal(place: Place, storage: str) -> Finding:
 
 def _kept_nowhere(storage: str) -> Finding:
     if storage == _NEVER:
-        text = "no line is kept: journald has Storage=none"
-        return Finding(_JOURNAL, State.WARNING, text, _KEEP)
+        return Finding(_JOURNAL, State.WARNING, "no line is kept: journald has Storage=none", _KEEP)
     text = "systemd-journald has kept no line since it was started"
     remedy = "as root: systemctl restart systemd-journald; its systemctl status shows errors"
     return Finding(_JOURNAL, State.WARNING, text, remedy)

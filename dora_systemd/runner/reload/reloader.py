@@ -333,9 +333,8 @@ class Reloader:
         if current is None or self._moved() is not None:
             return []
         if identity(dataflow) is None:
-            hint = "put it back, or stop the dataflow"
             message = f"cannot read {dataflow}: there is no such file"
-            raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+            raise DoraSystemdError(message, "put it back, or stop the dataflow", ExitCode.NOT_FOUND)
         self._note_imports()
         versions = self._versions
         stale = {path for path in (dataflow, self._settings.path) if versions.differ(path)}

@@ -152,9 +152,8 @@ def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
     index = _runs_before(run)
     if index is None:
         if run and not journal.has_run(query.scope, query.name, run):
-            message = f"cannot find the run {quoted(run)}"
             hint = "doractl list --all, or journalctl --field=DORA_RUN"
-            raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+            raise DoraSystemdError(f"cannot find the run {quoted(run)}", hint, ExitCode.NOT_FOUND)
         return replace(query, run=run)
     if not query.name:
         hint = "say which dataflow: doractl logs NAME --run CURRENT"

@@ -180,9 +180,8 @@ def _check(plan: Plan, dataflow: Dataflow, root: str, want_build: bool) -> None:
         reason = "hot reload is on, and the files of a release do not change"
         raise _refusal(reason, "deploy with --no-hot-reload, or use doractl start")
     if plan.options.uv:
-        reason = "uv is on, and would write to the release"
         hint = "deploy with --no-uv: then uv makes .venv from uv.lock, also for build: pip install"
-        raise _refusal(reason, hint)
+        raise _refusal("uv is on, and would write to the release", hint)
     if plan.members:
         reason = "it runs on several machines"
         raise _refusal(reason, "bring the files to each of them, and use doractl start")
