@@ -478,3 +478,14 @@ def test_what_is_asked_for_otherwise(tmp_path: Path) -> None:
         assert f"the runner is of dora-systemd {__version__}" in caught.value.message
 
     live(work)
+
+
+@pytest.mark.parametrize("is_hot", [True, False])
+def test_only_hot_reload_reads_all_imports_after_a_start(tmp_path: Path, is_hot: bool) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, is_hot=is_hot)
+        bench.begin()
+        bench.reloader.has_started()
+        assert len(asyncio.all_tasks()) == 1 + is_hot
+
+    live(work)
