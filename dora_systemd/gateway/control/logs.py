@@ -82,9 +82,8 @@ def _read_logs(scope: Scope, request: Request, node: str) -> tuple[str, list[byt
 def _elsewhere(scope: Scope, uuid: str, node: str, now: int) -> list[Record]:
     """Return records that name other machines with lines, if there are any. node: "" for all."""
     cell = find_if_loaded(scope, uuid)
-    if cell is None or cell.options.machine or not cell.options.placed:
+    if cell is None or cell.options.machine:
         return []
-    # Imported late: most dataflows run on one machine.
     return lines_elsewhere(cell.name, cell.options.placed, node, now)
 
 

@@ -61,11 +61,8 @@ def log_query(scope: Scope, message: PageMessage) -> tuple[LogQuery, Lines]:
 
 
 def _notes(cell: Cell, node: str) -> Lines:
-    options = cell.options
-    if options.machine or not options.placed:
-        return []
-    # Imported late: most dataflows run on one machine.
-    records = lines_elsewhere(cell.name, options.placed, node, time.time_ns() // 1000)
+    placed = () if cell.options.machine else cell.options.placed
+    records = lines_elsewhere(cell.name, placed, node, time.time_ns() // 1000)
     return list(map(line_values, records))
 
 
