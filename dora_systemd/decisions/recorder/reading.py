@@ -13,11 +13,13 @@ from typing import NamedTuple, Protocol
 
 from dora_systemd.decisions.recorder.ring import (
     ALIGN,
+    RECORD,
     RECORD_SIZE,
+    SMALL,
     Header,
     RecordHead,
     State,
-    format_record,
+    crc_of,
     parse_header,
     parse_record,
     read_state,
@@ -147,13 +149,16 @@ class Reading:
         return self._state(at)[0].tail
 
     def _message(self, at: int, head: RecordHead, position: int, crc: int) -> Recorded | None:
+        """Read a message; None if it is damaged, or given up while it was read."""
         start = position + RECORD_SIZE
-        body = read_tape(self._source, self.header, at, start, head.body_size)
-        if format_record(head, [body])[4:8] != crc.to_bytes(4, "little"):
+        body = memoryview(read_tape(self._source, self.header, at, start, head.body_size))
+        schema, rest = body[: head.schema_size], body[head.schema_size :]
+        meta, data = rest[: head.meta_size], rest[head.meta_size :]
+        if crc_of(RECORD.pack(*head), (schema, meta, data)) != crc:
             return None
-        schema, rest = body[: head.schema_size], memoryview(body)[head.schema_size :]
-        meta, data = bytes(rest[: head.meta_size]), bytes(rest[head.meta_size :])
-        return Recorded(at, head, schema or self._schema(at), meta, data)
+        if len(body) > SMALL and self._tail(at) > position:
+            return None
+        return Recorded(at, head, bytes(schema) or self._schema(at), bytes(meta), bytes(data))
 
     def _schema(self, at: int) -> bytes:
         """The schema of the state, which the recorder may have written after the first look."""

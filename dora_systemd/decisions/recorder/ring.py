@@ -7,7 +7,9 @@ header: magic, version, number of outputs, span, budget, length of the JSON text
 state: one page for each output. Twice, written in turn: CRC, length of the schema, version, tail,
 head and counters, of which the last version without damage counts; then the schema.
 tape: `span` bytes for each output. A record: magic, CRC, length, number, times, lengths of its
-parts; its own schema unless it is that of the state, metadata, and an Arrow IPC message.
+parts; its own schema unless it is that of the state, metadata, and an Arrow IPC message. Of a part
+above 64 kB the CRC has the beginning and the end: that of 1 MB takes 0.7 ms, and the window already
+shows whether a message is whole.
 
 All numbers are little-endian. Times are in ns.
 """
@@ -23,7 +25,7 @@ ALIGN = 64 * 1024
 MOST_OUTPUTS = 256
 MOST_TEXT = ALIGN - 64
 """Maximum bytes of the JSON text."""
-MAGIC, RECORD_MAGIC, VERSION = b"DORARING", 0x43455244, 1
+MAGIC, RECORD_MAGIC, VERSION = b"DORARING", 0x43455244, 2
 HEADER = struct.Struct("<8sIIQQII")
 CRC = struct.Struct("<I")
 STATE = struct.Struct("<IQQQQQQQQ")
@@ -38,6 +40,8 @@ _PREFIX = 2 * CRC.size
 RECORD_SIZE = _PREFIX + RECORD.size
 SMALL = 64 * 1024
 """Bytes: of a larger message only the last is kept, unless the output is named."""
+_CHECKED = 4096
+"""Bytes at both ends of a part above SMALL that its CRC has."""
 
 Part = Any
 """What os.pwritev() takes: bytes, or a buffer."""
@@ -201,10 +205,19 @@ def _states_in(data: bytes, schema: bytes) -> "Sequence[tuple[State, bytes]]":
 def format_record(head: RecordHead, parts: Sequence[Part]) -> bytes:
     """What precedes the parts of a record."""
     numbers = RECORD.pack(*head)
+    return struct.pack("<II", RECORD_MAGIC, crc_of(numbers, parts)) + numbers
+
+
+def crc_of(numbers: bytes, parts: Sequence[Part]) -> int:
+    """The CRC of a record. numbers: its head without magic and CRC."""
     crc = zlib.crc32(numbers)
     for one in parts:
-        crc = zlib.crc32(one, crc)
-    return struct.pack("<II", RECORD_MAGIC, crc) + numbers
+        if len(one) <= SMALL:
+            crc = zlib.crc32(one, crc)
+        else:
+            data = memoryview(one)
+            crc = zlib.crc32(data[-_CHECKED:], zlib.crc32(data[:_CHECKED], crc))
+    return crc
 
 
 def parse_record(data: bytes, most: int) -> "tuple[RecordHead, int]":

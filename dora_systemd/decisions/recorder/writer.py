@@ -32,19 +32,24 @@ class Tape:
 
     def __init__(self, store: Store, header: Header, at: int, page: int) -> None:
         self._store, self._header, self._at, self._page = store, header, at, page
+        self._base, self._span = tape_at(header, at), header.span
         self.messages: deque[tuple[int, int, int]] = deque()
         """Of each: bytes of the record, CLOCK_BOOTTIME, bytes of its data."""
         try:
-            self.state, self.schema = read_state(store, at)
-            self.number = self._restore()
+            state, self.schema = read_state(store, at)
+            self.number = self._restore(state)
         except ValueError:  # another program has written there
-            self.state, self.schema, self.number = State(), b"", 0
+            state, self.schema, self.number = State(), b"", 0
             self.messages.clear()
+        self._tail, self._head, self.received, self.dropped = state[:4]
+        self.evicted, self.too_large, self.largest, self._version = state[4:]
+        self.used = self.used_with(0)
+        """Bytes of the pages that the window takes."""
         self._clean()
 
-    def _restore(self) -> int:
+    def _restore(self, state: State) -> int:
         """Learn what an earlier recorder has written; return the number of its last message."""
-        position, head, number = self.state.tail, self.state.head, 0
+        position, head, number = state.tail, state.head, 0
         if not 0 <= head - position <= self._header.budget:
             raise ValueError("its window is impossible")
         while position < head:
@@ -57,68 +62,63 @@ class Tape:
     def _clean(self) -> None:
         """Make holes of all but the window: a recorder can be killed before it does."""
         self.commit()
-        low, high = self._down(self.state.tail), self._down(self.state.head + self._page - 1)
-        self._punch(high, low + self._header.span)
+        low, high = self._down(self._tail), self._down(self._head + self._page - 1)
+        self._punch(high, low + self._span)
 
     def _down(self, position: int) -> int:
         return position - position % self._page
-
-    @property
-    def used(self) -> int:
-        """Bytes of the pages that the window takes."""
-        return self.used_with(0)
 
     def used_with(self, size: int) -> int:
         """Bytes of the pages that the window takes with one more record."""
         if not self.messages and not size:
             return 0
-        high = self.state.head + size + self._page - 1
-        return self._down(high) - self._down(self.state.tail)
+        return self._down(self._head + size + self._page - 1) - self._down(self._tail)
 
     def commit(self) -> None:
         """Write the state."""
-        version = self.state.version + 1
-        self.state = self.state._replace(version=version)
+        self._version = version = self._version + 1
+        state = State(
+            *(self._tail, self._head, self.received, self.dropped),
+            *(self.evicted, self.too_large, self.largest, version),
+        )
         place = state_at(self._at) + version % 2 * STATE_SIZE
-        self._store.write(place, [format_state(self.state, self.schema)])
-
-    def count(self, **more: int) -> None:
-        """Add to counters of the state, which the next commit() writes."""
-        fields = {key: getattr(self.state, key) + value for key, value in more.items()}
-        self.state = self.state._replace(**fields)
+        self._store.write(place, [format_state(state, self.schema)])
 
     def drop_oldest(self) -> None:
-        """Give up the oldest message, and the pages that only it used."""
+        """Give up the oldest message, and the pages that only it used.
+
+        The next commit() writes that, unless pages have to go: no reader finds a hole in a window.
+        """
         size, *_ = self.messages.popleft()
-        before, tail = self._down(self.state.tail), self.state.tail + size
-        self.state = self.state._replace(tail=tail)
-        self.commit()  # first, so that no reader finds a hole in the window
+        before, tail = self._down(self._tail), self._tail + size
         after = self._down(tail if self.messages else tail + self._page - 1)
-        self._punch(before, after)
+        self._tail, self.used = tail, self.used - after + before
+        if after > before:
+            self.commit()
+            self._punch(before, after)
 
     def _punch(self, low: int, high: int) -> None:
-        base, span = tape_at(self._header, self._at), self._header.span
         if high <= low:
             return
-        place = low % span
-        first = min(high - low, span - place)
-        self._store.punch(base + place, first)
+        place = low % self._span
+        first = min(high - low, self._span - place)
+        self._store.punch(self._base + place, first)
         if high - low > first:
-            self._store.punch(base, high - low - first)
+            self._store.punch(self._base, high - low - first)
 
     def append(self, head: RecordHead, parts: Sequence[Part]) -> None:
         """Write a message; there has to be room for it."""
-        span, place = self._header.span, self.state.head % self._header.span
+        place = self._head % self._span
         parts = [format_record(head, parts), *parts]
-        base = tape_at(self._header, self._at)
-        if place + head.size <= span:
-            self._store.write(base + place, parts)
+        if place + head.size <= self._span:
+            self._store.write(self._base + place, parts)
         else:
-            data = b"".join(map(bytes, parts))
-            self._store.write(base + place, [data[: span - place]])
-            self._store.write(base, [data[span - place :]])
+            data, left = b"".join(map(bytes, parts)), self._span - place
+            self._store.write(self._base + place, [data[:left]])
+            self._store.write(self._base, [data[left:]])
         self.messages.append((head.size, head.steady_ns, head.data_size))
-        self.state = self.state._replace(head=self.state.head + head.size)
+        self._head += head.size
+        self.used = self.used_with(0)
         self.commit()
 
     def has(self, schema: bytes) -> bool:
@@ -158,22 +158,21 @@ class Writer:
 
     def put(self, at: int, message: Message, dropped: int = 0) -> None:
         """Write a message of the output number `at`. dropped: messages lost before this one."""
-        tape, data_size = self.tapes[at], memoryview(message.data).nbytes
-        tape.count(received=1, dropped=dropped)
-        schema = b"" if tape.has(message.schema) else message.schema
-        parts = [one for one in (schema, message.meta, message.data) if len(one)]
-        sizes = len(schema), len(message.meta), data_size
+        tape, (schema, meta, data, received, steady, sent) = self.tapes[at], message
+        tape.received += 1
+        tape.dropped += dropped
+        own, data_size = b"" if tape.has(schema) else schema, len(data)
+        sizes = len(own), len(meta), data_size
         size = (RECORD_SIZE + sum(sizes) + 7) // 8 * 8
-        if not self._make_room(tape, size, message.steady_ns):
-            largest = max(tape.state.largest, data_size)
-            tape.state = tape.state._replace(largest=largest)
-            tape.count(too_large=1)
+        if not self._make_room(tape, size, steady):
+            tape.largest = max(tape.largest, data_size)
+            tape.too_large += 1
             tape.commit()
             return
         self._number += 1
-        times = message.received_ns, message.steady_ns, message.sent_ns
         before = tape.used
-        tape.append(RecordHead(size, self._number, *times, *sizes), parts)
+        parts = [one for one in (own, meta, data) if len(one)]
+        tape.append(RecordHead(size, self._number, received, steady, sent, *sizes), parts)
         self._used += tape.used - before
         if self.header.only_small and data_size > SMALL:
             while len(tape.messages) > 1:
@@ -190,7 +189,7 @@ class Writer:
             victim = self._largest(tape, size)
             if victim is None:
                 return False
-            victim.count(evicted=1)
+            victim.evicted += 1
             self._drop(victim)
         return True
 
@@ -199,7 +198,7 @@ class Writer:
         some = [one for one in self.tapes if len(one.messages) > 1]
         if not some:
             return None
-        return max(some, key=lambda one: one.used_with(size if one is tape else 0))
+        return max(some, key=lambda one: one.used_with(size) if one is tape else one.used)
 
     def _drop(self, tape: Tape) -> None:
         before = tape.used

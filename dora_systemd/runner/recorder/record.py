@@ -27,23 +27,28 @@ DISCARDED = re.compile(rb"Discarding event for input `(\d+)`")
 """What dora prints for each message that its queue has no room for; there is no counter of it."""
 PIPE_SIZE = 1 << 20
 MOST_META = 16 * 1024
-PAUSE_SECONDS = 0.25
+PAUSE_NS = 100_000_000
+"""Between two reads of what dora has printed."""
 KILLED_FIRST = "1000"
 EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)  # noqa: UP017 - for Python 3.9
 MICROSECOND = datetime.timedelta(microseconds=1)
+to_json = json.JSONEncoder(default=str).encode
 
 
 class FileStore:
-    """The file of a ring. Raises OSError."""
+    """The file of a ring. mapped: its first bytes, which are written often. Raises OSError."""
 
-    def __init__(self, fd: int) -> None:
-        self._fd = fd
+    def __init__(self, fd: int, mapped: int) -> None:
+        self._fd, self._mapped = fd, mmap.mmap(fd, mapped)
         library = ctypes.CDLL(None, use_errno=True)
         self._punch = getattr(library, "fallocate64", None) or library.fallocate
 
     def write(self, at: int, parts: Sequence[Any]) -> None:
         """Write the parts one after the other."""
-        size = sum(memoryview(one).nbytes for one in parts)
+        size = sum(map(len, parts))
+        if at + size <= len(self._mapped):
+            self._mapped[at : at + size] = b"".join(parts)
+            return
         done = os.pwritev(self._fd, parts, at)
         if done < size:
             rest = b"".join(map(bytes, parts))[done:]
@@ -69,17 +74,22 @@ class Drops:
         with suppress(OSError):
             fcntl.fcntl(writer, 1031, PIPE_SIZE)  # F_SETPIPE_SZ, which Python has from 3.10 on
         os.dup2(writer, 1)
-        self._text = b""
+        self._text, self._read_ns = b"", 0
         self._counts: dict[int, int] = {}
 
-    def take(self, at: int) -> int:
-        """Messages of the output number `at` since the last call."""
+    def take(self, at: int, now_ns: int) -> int:
+        """Messages of the output number `at` since the last call. now_ns: CLOCK_BOOTTIME."""
+        if now_ns - self._read_ns > PAUSE_NS:
+            self._read_ns = now_ns
+            self._read()
+        return self._counts.pop(at, 0) if self._counts else 0
+
+    def _read(self) -> None:
         with suppress(BlockingIOError):
             self._text += os.read(self._reader, PIPE_SIZE)
             *lines, self._text = self._text.split(b"\n")
             for one in DISCARDED.findall(b"\n".join(lines)):
                 self._counts[int(one)] = self._counts.get(int(one), 0) + 1
-        return self._counts.pop(at, 0)
 
 
 def give_way() -> None:
@@ -121,9 +131,10 @@ class Recorder:
     def put(self, at: int, value: Any, metadata: Any) -> None:
         """Copy one message. metadata: dora's, with the time of the message."""
         schema, data = self._serialized(at, value)
-        times = time.time_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME), _sent(metadata)
+        now_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        times = time.time_ns(), now_ns, _sent(metadata)
         message = self._writer.Message(schema, _meta(metadata), data, *times)
-        self._ring.put(at, message, self._drops.take(at))
+        self._ring.put(at, message, self._drops.take(at, now_ns))
 
     def _serialized(self, at: int, value: Any) -> tuple[bytes, Any]:
         if self._arrow.types.is_dictionary(value.type):
@@ -142,8 +153,10 @@ def _sent(metadata: Any) -> int:
 
 
 def _meta(metadata: Any) -> bytes:
-    own = {key: value for key, value in (metadata or {}).items() if key != "timestamp"}
-    data = json.dumps(own, default=str).encode(errors="replace") if own else b"{}"
+    if not metadata or (len(metadata) == 1 and "timestamp" in metadata):
+        return b"{}"
+    own = {key: value for key, value in metadata.items() if key != "timestamp"}
+    data = to_json(own).encode(errors="replace")
     return data if len(data) <= MOST_META else b"{}"
 
 
@@ -152,17 +165,13 @@ def record(node: Any, recorder: Recorder) -> None:
 
     The runner then starts another recorder for the inputs that are left.
     """
-    while True:
-        began = time.monotonic()
-        event = node.next(timeout=PAUSE_SECONDS)
-        kind = "" if event is None else event["type"]
+    # Without a timeout, for which dora would wake a thread at each message.
+    while (event := node.next()) is not None:
+        kind = event["type"]
         if kind == "INPUT":
             recorder.put(int(event["id"]), event["value"], event["metadata"])
         elif kind in ("STOP", "INPUT_CLOSED"):
             return
-        elif time.monotonic() - began < PAUSE_SECONDS / 2:
-            # Some other event than a timeout came early: do not call next() again at once.
-            time.sleep(PAUSE_SECONDS / 2)
         del event  # its memory is that of the node that has sent it
 
 
@@ -170,7 +179,9 @@ def main(path: str, package: str) -> None:
     """Open the ring, and run as a node."""
     give_way()
     writer, drops = import_writer(package), Drops()
-    ring = writer.Writer(FileStore(receive_ring(path)), mmap.PAGESIZE)
+    fd = receive_ring(path)
+    header = writer.parse_header(os.pread(fd, writer.ALIGN, 0))
+    ring = writer.Writer(FileStore(fd, writer.tape_at(header, 0)), mmap.PAGESIZE)
     import pyarrow
     from dora import Node
 

@@ -230,28 +230,44 @@ def test_a_damaged_message_is_counted() -> None:
     assert (len(messages), reading.damaged) == (2, 1)
 
 
-class Moving(MemoryStore):
-    """A recorder that writes on while the ring is read."""
+def test_of_a_large_message_both_ends_are_checked() -> None:
+    for place, is_damaged in ((1000, True), (SMALL, False), (2 * SMALL - 1000, True)):
+        store, header = ring(budget=64 * PAGE)
+        writer(store).put(0, message(bytes(2 * SMALL)))
+        store.write(tape_at(header, 0) + place, [b"x"])
+        messages, reading = read(store)
+        assert (len(messages), reading.damaged) == (1 - is_damaged, is_damaged)
 
-    more = 0
+
+class Moving(MemoryStore):
+    """A recorder that writes on while the ring is read: `more` messages of `size` bytes."""
+
+    more = size_of_more = 0
     writer: Writer
 
     def read(self, at: int, size: int) -> bytes:
-        if self.more and size > 3000:
-            self.more -= 1
-            self.writer.put(0, message(bytes(4000), 100 + self.more))
+        if self.more and size == self.size_of_more + len(b"{}"):
+            early, quarter = super().read(at, size), size // 4
+            while self.more:
+                self.more -= 1
+                one = message(bytes([self.more]) * self.size_of_more, 100 + self.more)
+                self.writer.put(0, one)
+            late = super().read(at, size)
+            return early[:quarter] + late[quarter:-quarter] + early[-quarter:]
         return super().read(at, size)
 
 
-def test_a_ring_that_is_written_meanwhile_has_the_last_message_of_each_output() -> None:
-    store, _ = ring(budget=4 * PAGE)
+@pytest.mark.parametrize("size", [5000, 2 * SMALL])
+def test_a_ring_that_is_written_meanwhile_has_the_last_message_of_each_output(size: int) -> None:
+    store, _ = ring(budget=2 * size + 2 * PAGE)
     store.__class__ = Moving
     assert isinstance(store, Moving)
-    store.writer = writer(store)
-    store.writer.put(0, message(bytes(4000)))
+    store.writer, store.size_of_more = writer(store), size
+    store.writer.put(0, message(bytes([9]) * size))
     store.more = 3
     messages, reading = read(store)
-    assert messages[-1].data == datas(store)[-1]
+    assert [one.data for one in messages] == [bytes(size)]
+    assert datas(store)[-1] == bytes(size)
     assert reading.damaged == 0
 
 

@@ -15,17 +15,14 @@ from dora_systemd.runner.recorder.keep import RingSocket, fitted_ring, header_of
 PACKAGE = Path(dora_systemd.__file__).parent
 SCRIPT = PACKAGE / "runner" / "recorder" / "record.py"
 DORA = """
-import datetime, os, sys, time
+import datetime, os
 
 SENT = datetime.datetime(2026, 11, 27, tzinfo=datetime.timezone.utc)
 EVENTS = [{events}]
 
 class Node:
-    def next(self, timeout):
+    def next(self):
         event = EVENTS.pop(0)
-        if event == "timeout":
-            time.sleep(timeout)
-            return None
         if isinstance(event, bytes):
             os.write(1, event)
             return {{"type": "NODE_RESTARTED"}}
@@ -108,7 +105,7 @@ STOP = '{"type": "STOP"}'
 def test_messages_are_copied(tmp_path: Path) -> None:
     metadata = '{"timestamp": SENT, "width": 3, "odd": {1, 2}}'
     messages, _ = recorded(
-        *(tmp_path, '"timeout"', event(1, b"one", metadata=metadata), event(0, b"two")),
+        *(tmp_path, event(1, b"one", metadata=metadata), event(0, b"two")),
         *(event(1, b"three", "dictionary"), STOP, event(0, b"never")),
     )
     assert [(one.output, one.schema, one.data) for one in messages] == [

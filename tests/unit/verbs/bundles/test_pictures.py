@@ -47,7 +47,7 @@ class Bench:
         names = [f"camera/out{at}" for at in range(outputs)]
         fd = fitted_ring(-1, header_of(Record(), names, {"uuid": UUID}))
         self.fds.append(fd)
-        writer = Writer(FileStore(fd), PAGE)
+        writer = Writer(FileStore(fd, ALIGN), PAGE)
         for number, (at, metadata, data) in enumerate(messages):
             one = message(data, number, SCHEMA)
             now = NOW_US * 1000 + number

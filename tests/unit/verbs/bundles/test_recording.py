@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.decisions.recorder.record import Record
+from dora_systemd.decisions.recorder.ring import ALIGN
 from dora_systemd.decisions.recorder.writer import Writer
 from dora_systemd.runner.recorder.keep import fitted_ring, header_of
 from dora_systemd.runner.recorder.record import FileStore
@@ -42,7 +43,7 @@ def ring() -> Iterator[int]:
     facts = {"uuid": options().uuid}
     fd = fitted_ring(-1, header_of(Record(), ["camera/image"], facts))
     one = message(BATCH, 5, SCHEMA)._replace(meta=json.dumps(IMAGE).encode())
-    Writer(FileStore(fd), PAGE).put(0, one)
+    Writer(FileStore(fd, ALIGN), PAGE).put(0, one)
     yield fd
     os.close(fd)
 
@@ -75,7 +76,7 @@ def test_the_messages_and_their_pictures(ring: int) -> None:
 
 @pytest.mark.parametrize("size", [100, 40_000])
 def test_the_newest_messages_that_fit(ring: int, size: int) -> None:
-    store = Writer(FileStore(ring), PAGE)
+    store = Writer(FileStore(ring, ALIGN), PAGE)
     for number in range(400_000 // size):
         store.put(0, message(number.to_bytes(4, "little") + bytes(size), 6 + number, SCHEMA))
     left_out, sink = list[str](), Sink(200_000)

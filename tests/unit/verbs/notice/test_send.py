@@ -10,6 +10,7 @@ from dora_systemd.adapters.bundles.reader import opened
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.notice.happened import FAILED, Happened
 from dora_systemd.decisions.recorder.record import Record
+from dora_systemd.decisions.recorder.ring import ALIGN
 from dora_systemd.decisions.recorder.writer import Writer
 from dora_systemd.runner.recorder.keep import fitted_ring, header_of
 from dora_systemd.runner.recorder.record import FileStore
@@ -105,7 +106,7 @@ def test_the_last_messages_are_those_at_the_failure(
     """systemd gives the memory of a recorder back when the dataflow is stopped or started again."""
     sender = robot("black_box=yes", "record=yes", is_user=True)
     ring = fitted_ring(-1, header_of(Record(), ["camera/image"], {"uuid": options().uuid}))
-    Writer(FileStore(ring), PAGE).put(0, message(BATCH, 5, SCHEMA))
+    Writer(FileStore(ring, ALIGN), PAGE).put(0, message(BATCH, 5, SCHEMA))
     manager.units[UNIT]["MainPID"] = os.getpid()
     sender.learn()
     manager.units[UNIT]["MainPID"] = 0
