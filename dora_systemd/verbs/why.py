@@ -12,14 +12,16 @@ from dora_systemd.decisions.cell.restarts import restart_of
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus, is_stopped
 from dora_systemd.decisions.life import node_table
 from dora_systemd.decisions.life.causes import NO_END
+from dora_systemd.decisions.logs.journal_events import GIVEN_UP
 from dora_systemd.decisions.logs.query import scope_matches
+from dora_systemd.decisions.notice.happened import Happened
 from dora_systemd.decisions.releases.past import FAILED as TRIAL_FAILED
 from dora_systemd.decisions.releases.past import Switch, completed, undone
 from dora_systemd.decisions.resources.containers import format_outside
 from dora_systemd.decisions.views.dataflows import DEGRADED, FAILED, FROZEN
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
-from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE, plain_text
+from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE, lives_until, plain_text
 from dora_systemd.decisions.why.postmortem import examine
 from dora_systemd.decisions.why.report import LINES, Report, Subject
 from dora_systemd.decisions.why.stack import Frame, is_of_stack
@@ -48,14 +50,24 @@ WORDS_OF_START = 10
 """Maximum number of lines that a failed start prints."""
 
 
-def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReader) -> Report:
+def explain(
+    manager: Manager,
+    scope: Scope,
+    selector: str,
+    journal: JournalReader,
+    failure: Happened | None = None,
+) -> Report:
     """Explain what happened to the dataflow of `selector`, and why.
 
+    failure: then the report is about the dataflow as it was at that failure.
     Raises DoraSystemdError: NOT_FOUND, USAGE if several match.
     """
     cell, subject = _select(manager, scope, selector)
-    facts = _facts(manager, scope, cell) if cell else Facts(now_boot=now_boot())
-    verdict = _verdict(journal, scope, subject, facts)
+    if failure is not None:
+        facts = _facts_then(failure)
+    else:
+        facts = _facts(manager, scope, cell) if cell else Facts(now_boot=now_boot())
+    verdict = _verdict(journal, scope, subject, facts, failure.at_us if failure else 0)
     budget = None
     if cell and not verdict.is_given_up:
         budget = restart_budget(manager, scope, cell, read_status(scope, cell))
@@ -87,8 +99,16 @@ def explain_now(manager: Manager, scope: Scope, selector: str, journal: JournalR
     return replace(report, waits=read_cpu_waits(reading), outside=outside)
 
 
-def _verdict(journal: JournalReader, scope: Scope, subject: Subject, facts: Facts) -> Verdict:
-    """The verdict of the journal.
+def _facts_then(failure: Happened) -> Facts:
+    if failure.what != GIVEN_UP:
+        return Facts(now_boot=now_boot())
+    return Facts(DEGRADED, failed={failure.node: failure.cause}, now_boot=now_boot())
+
+
+def _verdict(
+    journal: JournalReader, scope: Scope, subject: Subject, facts: Facts, until_us: int
+) -> Verdict:
+    """The verdict of the journal. until_us: of the last record that counts, or 0.
 
     systemd knows that a unit has ended before journald has written what systemd and the runner
     report of that end, so an end without any record is read again.
@@ -97,7 +117,7 @@ def _verdict(journal: JournalReader, scope: Scope, subject: Subject, facts: Fact
 
     def read() -> Verdict:
         lives = read_lives(journal, scope, subject.name, subject.uuid, subject.is_loaded)
-        return examine(lives, facts, shutdowns)
+        return examine(lives_until(lives, until_us), facts, shutdowns)
 
     return read_when_written(read, lambda one: subject.is_loaded and one.summary == NO_END)
 

@@ -47,6 +47,7 @@ class Manifest:
     node: str = ""  # that `why` names, or ""
     cause: str = ""  # see `cause` in dora-systemd-json(7)
     summary: str = ""  # what ended and how
+    state: str = ""  # of the dataflow when the bundle was written, as in `list`
     versions: Mapping[str, str | None] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()  # what is not in the bundle, and why
     parts: tuple[Part, ...] = ()
@@ -74,6 +75,7 @@ def format_manifest(one: Manifest) -> str:
         "node": one.node,
         "cause": one.cause,
         "summary": one.summary,
+        "state": one.state,
         "versions": dict(one.versions),
         "rules": RULES,
         "left_out": list(one.left_out),
@@ -118,6 +120,7 @@ def _parsed(values: Mapping[str, Any]) -> Manifest:
     versions = as_mapping(values["versions"])
     return Manifest(
         **{key: _text(values[key]) for key in texts},
+        state=_text(values.get("state", "")),  # earlier versions have none
         at_us=_number(values["at_us"]),
         versions={_text(key): None if one is None else _text(one) for key, one in versions.items()},
         left_out=tuple(map(_text, left_out)),

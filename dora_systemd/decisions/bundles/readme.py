@@ -24,6 +24,7 @@ ANNOUNCEMENT = (
     "nothing is removed from that: a secret that a node has written to its log is in this bundle."
 )
 _WITHOUT = "What nodes have written and sent was left out, as requested by --no-journal."
+_THEN = "The report is about the failure; when the bundle was written, the dataflow was {}."
 _RULES = (
     "Never in a bundle: values of environment variables, arguments of nodes and of doractl, "
     "settings, credentials, addresses of repositories."
@@ -45,6 +46,7 @@ def format_readme(manifest: Manifest, why: str, names: Sequence[str], want_journ
     return "\n".join(
         [
             one_line(f"{title}, {format_moment(manifest.at_us)}{by}"),
+            *([one_line(_THEN.format(manifest.state))] if manifest.event else []),
             "",
             why,
             "",

@@ -35,7 +35,15 @@ def _cells(row: BundleRow) -> tuple[str, ...]:
     if row.manifest is None:
         return (row.name, row.id, UNKNOWN, row.event, size, "it cannot be read")
     at = local_time(row.manifest.at_us)
-    return (row.name, row.id, at, row.event, size, row.manifest.summary or UNKNOWN)
+    return (row.name, row.id, at, row.event, size, _why(row.manifest))
+
+
+def _why(about: Manifest) -> str:
+    """What has failed; without a failure the state of the dataflow, and who has requested it."""
+    if about.cause or about.event:
+        return about.summary or UNKNOWN
+    by = f"requested by {about.by}" if about.by else ""
+    return "; ".join(filter(None, (about.state, by))) or UNKNOWN
 
 
 def bundle_object(row: BundleRow) -> dict[str, Any]:
@@ -52,6 +60,7 @@ def bundle_object(row: BundleRow) -> dict[str, Any]:
         "node": (known.node or None) if known else None,
         "cause": (known.cause or None) if known else None,
         "summary": (known.summary or None) if known else None,
+        "state": (known.state or None) if known else None,
         "by": (known.by or None) if known else None,
         "left_out": list(known.left_out) if known else None,
     }

@@ -145,6 +145,20 @@ def find_lives(happenings: Iterable[Happening]) -> list[Life]:
     return [Life(tuple(life)) for life in found.values()]
 
 
+def lives_until(lives: Sequence[Life], at_us: int) -> list[Life]:
+    """The lives up to the record of that time; all for 0, and if no record has that time."""
+    places = [
+        (number, place)
+        for number, life in enumerate(lives)
+        for place, one in enumerate(life.happenings)
+        if at_us and one.at_us == at_us
+    ]
+    if not places:
+        return list(lives)
+    number, place = places[-1]
+    return [*lives[:number], Life(lives[number].happenings[: place + 1])]
+
+
 def with_restarts(lives: Sequence[Life]) -> list[Life]:
     """The last life, and those before it that led to it by automatic restarts of systemd."""
     chain = list(lives[-1:])

@@ -38,8 +38,9 @@ from dora_systemd.decisions.bundles.manifest import (
 )
 from dora_systemd.decisions.bundles.readme import format_readme
 from dora_systemd.decisions.cell.black_box import BlackBox, Past, is_too_soon, to_remove
+from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.logs.journal_events import BUNDLE_REFUSED, BUNDLE_WRITTEN
-from dora_systemd.decisions.notice.happened import POWER_LOST
+from dora_systemd.decisions.notice.happened import POWER_LOST, Happened
 from dora_systemd.decisions.why.report import format_report
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -117,17 +118,18 @@ def _evidence(
     selector: str,
     want_journal: bool,
     want_pictures: bool = False,
-    has_lost_power: bool = False,
-    ring: RingFile | None = None,
+    failure: "Failure | None" = None,
 ) -> Evidence:
     """Find the dataflow, and what is known of it. Raises DoraSystemdError."""
     manager = reach(scope)
-    report = explain(manager, scope, selector, JournalReader())
+    happened = failure.happened if failure else None
+    report = explain(manager, scope, selector, JournalReader(), happened)
     subject = report.subject
     cell = read_cell(manager, subject.unit) if subject.is_loaded else None
     row = subject_row(manager, scope, subject)
     found = partial(examine, reach, scope)
-    more = want_pictures, has_lost_power, ring
+    is_cut = failure is not None and failure.event == POWER_LOST
+    more = want_pictures, is_cut, failure.ring if failure else None
     return Evidence(manager, scope, report, row, cell, want_journal, found, *more)
 
 
@@ -137,6 +139,8 @@ class Failure(NamedTuple):
     event: str  # one of ORDER of decisions/notice/happened.py, or POWER_LOST
     details: dict[str, str]  # of the event of the bundle
     ring: RingFile | None = None  # of the recorder, opened before the dataflow could be unloaded
+    # what the report is about, if the dataflow may have been stopped since
+    happened: Happened | None = None
 
 
 def write_after(
@@ -175,18 +179,12 @@ def _written_after(
     now_us: int,
 ) -> str:
     """Write the bundle; return its path. Raises DoraSystemdError."""
-    is_cut = failure.event == POWER_LOST
-    what = _evidence(
-        reach, scope, cell.uuid, want_journal=True, has_lost_power=is_cut, ring=failure.ring
-    )
+    what = _evidence(reach, scope, cell.uuid, want_journal=True, failure=failure)
     manifest = replace(_manifest(what, BY), event=failure.event)
     store = BundleStore(scope.state_root, cell.name)
     with locked(store), _explained(store.path):
         store.remove_partial()
         past = [_past(one) for one in store.known() if one.event != REQUESTED]
-        if what.cell is None:
-            # It was stopped after the failure: the report has the stop as the cause.
-            past = [one._replace(node=manifest.node, cause=manifest.cause) for one in past]
         if is_too_soon(past, manifest.node, manifest.cause, now_us):
             about = f"node {manifest.node}" if manifest.node else "the same cause"
             message = f"one about {about} was written less than 10 minutes ago"
@@ -221,8 +219,9 @@ def _manifest(what: Evidence, by: str) -> Manifest:
         at_us=time.time_ns() // 1000,
         by=by,
         node=verdict.node,
-        cause=str(verdict.cause),
+        cause="" if verdict.cause in (Cause.STOPPED, Cause.FINISHED) else str(verdict.cause),
         summary=verdict.summary,
+        state=what.row.status,
         versions={
             "doractl": __version__,
             "python": platform.python_version(),

@@ -19,10 +19,11 @@ from dora_systemd.adapters.host.files import write_atomic
 from dora_systemd.adapters.journal.note import note_request
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.black_box import BlackBox, is_after_boot
-from dora_systemd.decisions.logs.journal_events import NOTICE_FAILED, NOTICE_SENT
+from dora_systemd.decisions.logs.journal_events import GIVEN_UP, NOTICE_FAILED, NOTICE_SENT
 from dora_systemd.decisions.logs.query import cut_matches
 from dora_systemd.decisions.notice.command import is_command, unit_of, words_of
 from dora_systemd.decisions.notice.happened import (
+    FAILED,
     MOST_ENDS,
     POWER_LOST,
     Happened,
@@ -181,7 +182,9 @@ class Sender:
         from dora_systemd.verbs.bundles.write import Failure, write_after
 
         details = {"until": str(happened[0].mono_us), "pause": str(pause_us)}
-        failure = Failure(main_one(happened).what, details, self._memory.ring_of(cell.uuid))
+        main = main_one(happened)
+        about = main if main.what in (FAILED, GIVEN_UP) else None
+        failure = Failure(main.what, details, self._memory.ring_of(cell.uuid), about)
         write_after(self._reach, self._scope, cell, box, failure)
 
     def write_after_boot(self, now_us: int) -> None:

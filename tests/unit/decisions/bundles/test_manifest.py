@@ -32,7 +32,11 @@ ONE = Manifest(
 
 
 def test_there_and_back() -> None:
-    assert parse_manifest(format_manifest(ONE).encode(), "x.tar") == ONE
+    known = replace(ONE, state="Failed")
+    assert parse_manifest(format_manifest(known).encode(), "x.tar") == known
+    values = json.loads(format_manifest(known))
+    del values["state"]
+    assert parse_manifest(json.dumps(values).encode(), "x.tar") == ONE
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"kind": "x"}', "[" * 100_000, "\xff"])
@@ -82,6 +86,9 @@ def test_the_readme_announces_what_nodes_have_written() -> None:
     assert ANNOUNCEMENT in text
     assert "stacks/" in text
     assert "unit.txt" not in text
+    assert "was Running" not in text
+    failed = replace(ONE, event="failed", state="Running")
+    assert "the dataflow was Running." in format_readme(failed, "robot: Failed", [], True)
     without = format_readme(ONE, "robot: Failed", ["why.json"], False)
     assert ANNOUNCEMENT not in without
     assert "--no-journal" in without
@@ -98,3 +105,18 @@ def test_the_table() -> None:
     assert (found["at_us"], found["cause"], found["size_bytes"]) == (ONE.at_us, ONE.cause, 2048)
     assert found.keys() == bundle_object(broken).keys()
     assert bundle_object(row._replace(manifest=replace(ONE, node="")))["node"] is None
+
+
+@pytest.mark.parametrize(
+    ("manifest", "words"),
+    [
+        (replace(ONE, cause="", state="Stopped"), "Stopped; requested by root (doractl bundle)"),
+        (replace(ONE, cause="", by=""), "-"),
+        (replace(ONE, cause="", event="machine-lost"), "node camera: exit code 1"),
+        (replace(ONE, cause="", event="machine-lost", summary=""), "-"),
+    ],
+)
+def test_a_stop_is_no_failure(manifest: Manifest, words: str) -> None:
+    row = BundleRow("robot", "robot-1.tar", "/x/robot-1.tar", "requested", 2048, manifest)
+    assert format_bundles([row]).splitlines()[1].endswith(f"  {words}")
+    assert bundle_object(row)["cause"] is None

@@ -10,7 +10,8 @@ import pytest
 from dora_systemd.adapters.bundles.reader import opened
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.black_box import BlackBox
-from dora_systemd.decisions.notice.happened import POWER_LOST
+from dora_systemd.decisions.logs.journal_events import EVENTS
+from dora_systemd.decisions.notice.happened import POWER_LOST, Happened
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.why.report import format_report
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -27,6 +28,7 @@ from dora_systemd.verbs.bundles.write import Failure, write_after, write_bundle
 from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.list import find_row
 from dora_systemd.verbs.why import explain
+from tests.unit.fakes.journal import FakeJournal, failure_record, life_record
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.verbs.notice.failures import SECRET, fail
 
@@ -112,6 +114,53 @@ def test_bundles_of_failures_are_bounded(
     assert f"Bundle:   {paths[-1]} and 1 more; 1 not written, the last: one about " in shown
     why = format_report(explain(manager, scope, "robot", JournalReader()))
     assert f"Bundle:   {paths[-1]} and 1 more" in why
+
+
+def happening(event: str, at_us: int, **fields: str) -> dict[str, object]:
+    """The record of a life event, as `why` finds it."""
+    return {**life_record(event, at_us, MESSAGE_ID=EVENTS[event].message_id), **fields}
+
+
+@pytest.mark.parametrize("what", ["failed", "node-given-up"])
+def test_a_bundle_is_about_its_failure_whatever_came_after_that(
+    reach: Reach,
+    scope: ScopeIn,
+    manager: FakeManager,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    what: str,
+) -> None:
+    """It was restarted, and stopped; a bundle that is requested then is about the stop."""
+    first, second = ({"_SYSTEMD_INVOCATION_ID": one} for one in "12")
+    crash = {"DORA_NODE": "camera", "DORA_EXIT": "exit code 3"}
+    FakeJournal(monkeypatch, tmp_path).write(
+        happening("dataflow-stopped", 20, **second),
+        happening("stop-asked", 19, DORA_BY="root (doractl stop)"),
+        happening("dataflow-starting", 15, **second),
+        {**failure_record(10, "robot", options().uuid), "INVOCATION_ID": "1"},
+        happening("dataflow-failed", 9, **first, DORA_REASON="node camera: exit code 3"),
+        happening("node-given-up", 8, **first, **crash),
+        happening("node-crashed", 7, **first, **crash),
+        happening("dataflow-starting", 5, **first),
+    )
+    cell = read_cell(manager, "dora-robot.service")
+    assert cell
+    del manager.units["dora-robot.service"]
+    reason = "exit code 3 after 2 restarts"
+    happened = Happened(what, 10 if what == "failed" else 8, 0, "camera", reason)
+    path = Path(write_after(reach, scope, cell, BlackBox(), Failure(what, {}, None, happened)))
+    readme, _ = read_report(path)
+    with opened(path) as bundle:
+        about = bundle.manifest
+    words = "exit code 3" if what == "failed" else reason
+    assert (about.node, about.cause) == ("camera", "node-failed")
+    assert about.summary == f"node camera: {words}"
+    assert about.state == "Stopped"
+    assert f"robot: {'Failed' if what == 'failed' else 'Degraded'}\n" in readme
+    assert "the dataflow was Stopped" in readme
+    requested = write_bundle(reach, scope, options().uuid, "doractl bundle").manifest
+    assert (requested.node, requested.cause, requested.state) == ("", "", "Stopped")
+    assert requested.summary == "stopped by root (doractl stop)"
 
 
 def test_after_a_power_cut_there_is_no_recording(
