@@ -26,7 +26,11 @@ from dora_systemd.values import (
 KEYS = ("last", "memory", "outputs")
 MEGABYTE = 1024 * 1024
 ROOM = 160 * MEGABYTE
-"""Bytes that the recorder uses besides the ring: Python, pyarrow and the messages on their way."""
+"""Bytes that the recorder has at least besides the ring: Python, pyarrow, messages on their way."""
+_SHARE = 8
+"""The recorder may use this part of a machine's memory: 64 messages of all outputs can be on their
+way, of any size, because no queue of dora's is shorter. 6 MB 30 times a second need 70 MB, and
+200 MB if the recorder gets no CPU time for seconds."""
 _LEAST = MEGABYTE
 _FORM = "last=30s,memory=200M,outputs=NODE/OUTPUT+NODE/OUTPUT"
 _HINT = f"write {_FORM}, any of these keys; yes or no"
@@ -132,6 +136,11 @@ def check_memory(record: Record, total: int) -> None:
         has = f"this machine has {format_size(total // MEGABYTE * MEGABYTE)}"
         own = f"{format_size(record.memory)} and {format_size(ROOM)} for the recorder"
         raise _impossible(f"cannot record in {own}: {has}", "lower memory: of record")
+
+
+def limit_of(record: Record, total: int) -> int:
+    """Bytes that the group of the recorder may use. total: bytes of the machine."""
+    return record.memory + max(ROOM, total // _SHARE)
 
 
 def recorded_outputs(

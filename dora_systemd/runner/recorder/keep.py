@@ -27,10 +27,10 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.owes.probe import extra_definition
 from dora_systemd.decisions.recorder.record import (
-    ROOM,
     Record,
     check_memory,
     check_record,
+    limit_of,
     parse_record,
     recorded_outputs,
 )
@@ -136,8 +136,9 @@ _PATIENCE = 3
 """Ticks in which a recorder without inputs ends by itself."""
 _WEIGHT = 10
 """cpu.weight; other groups have 100."""
-_VARIABLES = {"RUST_LOG": "warn"}
-"""dora prints which messages it drops."""
+_VARIABLES = {"RUST_LOG": "warn", "MALLOC_MMAP_THRESHOLD_": "262144"}
+"""dora prints which messages it drops. What large messages have used is given back to the system:
+glibc keeps it otherwise, 100 MB and more."""
 
 
 class Rings:
@@ -291,7 +292,7 @@ class Recorder:
     def _limit(self) -> None:
         """Limit the group, as far as the kernel can: some containers have no controllers."""
         limits = {
-            "memory.max": str(self._record.memory + ROOM),
+            "memory.max": str(limit_of(self._record, total_memory())),
             "memory.swap.max": "0",
             "cpu.weight": str(_WEIGHT),
         }

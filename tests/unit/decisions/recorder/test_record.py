@@ -13,6 +13,7 @@ from dora_systemd.decisions.recorder.record import (
     check_memory,
     check_record,
     format_record,
+    limit_of,
     parse_record,
     recorded_outputs,
 )
@@ -114,3 +115,5 @@ def test_the_machine_needs_the_memory() -> None:
     words = "cannot record in 1G and 160M for the recorder: this machine has 1G"
     with pytest.raises(DoraSystemdError, match=words):
         check_memory(record, 1024 * MEGABYTE)
+    assert limit_of(record, 1024 * MEGABYTE) == record.memory + ROOM
+    assert limit_of(record, 8192 * MEGABYTE) == 2048 * MEGABYTE, "large messages wait for it"

@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.adapters.dora.probe import total_memory
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.extra import RECORDER, extra_id
 from dora_systemd.decisions.cell.options import SettingText
-from dora_systemd.decisions.recorder.record import ROOM, Record
+from dora_systemd.decisions.recorder.record import Record, limit_of
 from dora_systemd.decisions.recorder.ring import ALIGN, parse_header
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.recorder.keep import (
@@ -98,7 +99,9 @@ def test_a_node_of_its_own_within_limits(tmp_path: Path) -> None:
     }
     assert f"{RECORDER} / keep /p -u " in node["args"]
     assert str(tmp_path / "ring.sock") in node["args"]
-    assert (bench.group / "memory.max").read_text() == str(RECORD.memory + ROOM)
+    limit = limit_of(RECORD, total_memory())
+    assert (bench.group / "memory.max").read_text() == str(limit)
+    assert node["env"]["MALLOC_MMAP_THRESHOLD_"]
     assert (bench.group / "cpu.weight").read_text() == "10"
     assert bench.reasons() == []
 
