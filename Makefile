@@ -92,7 +92,7 @@ machines:  ## three machines on a network: doractl -H, pulled cables, power cuts
 	@$(PREPARE) machines
 	@$(CHECK) machines
 
-BENCHMARKS := start stop recovery startup many gateway cost logs messages reload deploy owes recorder machines spread
+BENCHMARKS := start stop recovery startup many gateway cost fleet logs messages reload deploy owes recorder machines spread
 
 bench:  ## what supervision costs, against named rivals; WHAT="start ...", ROUNDS=n
 	@$(PREPARE) container

@@ -85,9 +85,10 @@ class Doractl(Contestant):
     """Ours. The nodes write their stamps through the sandbox."""
 
     name = "doractl"
+    more: tuple[str, ...] = ()
 
     def start(self) -> None:
-        settings = ("--writable", str(STAMPS), "--restart-policy", "always")
+        settings = ("--writable", str(STAMPS), "--restart-policy", "always", *self.more)
         run("doractl", "start", str(self.flow), "--name", NAME, *settings)
 
     def stop(self) -> None:

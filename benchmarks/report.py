@@ -26,6 +26,7 @@ TITLES = {
     "many": "Many dataflows",
     "gateway": "The gateway beside many dataflows",
     "cost": "Memory and idle CPU",
+    "fleet": "Idle dataflows, and a boot",
     "logs": "Log path",
     "messages": "Messages",
     "reload": "Hot reload",
