@@ -99,7 +99,8 @@ def check(names: tuple[str, ...], output: str) -> int:
             wrong = [(error.message, error.hint)]
             worst = ExitCode.NO_HOST
         worst = worst or (ExitCode.FAILURE if wrong else ExitCode.OK)
-        objects.append({**_object(one), "facts": found or None, "problems": _problems(wrong)})
+        problems = [{"problem": reason, "hint": hint} for reason, hint in wrong]
+        objects.append({**_object(one), "facts": found or None, "problems": problems})
         if output != "json":
             _print_check(one, found, wrong)
     if output == "json":
@@ -127,10 +128,6 @@ def remove(name: str, force: bool) -> None:
 
 def _object(one: Known) -> dict[str, object]:
     return {"machine": one.name, "host": one.host.text, "key": one.key or None}
-
-
-def _problems(wrong: Sequence[tuple[str, str]]) -> list[dict[str, str]]:
-    return [{"problem": reason, "hint": hint} for reason, hint in wrong]
 
 
 def _print_check(one: Known, found: dict[str, object], wrong: Sequence[tuple[str, str]]) -> None:

@@ -32,12 +32,9 @@ def format_report(report: AdviceReport) -> str:
         return f"{report.name}: nothing to change, after {span}"
     lines = [f"{report.name}: {span}"]
     for one in report.advices:
-        lines += ["", f"{_who(one)}{_change(one)}", f"  {_evidence(one, recorded.lives)}"]
+        who = one.node or "all nodes together"
+        lines += ["", f"{who}: {_change(one)}", f"  {_evidence(one, recorded.lives)}"]
     return "\n".join([*lines, *_ending(report)])
-
-
-def _who(advice: Advice) -> str:
-    return f"{advice.node}: " if advice.node else "all nodes together: "
 
 
 def _change(advice: Advice) -> str:

@@ -60,7 +60,7 @@ def parse_share(text: str) -> int:
 
 def _too_small(text: str, what: str, smallest: str) -> DoraSystemdError:
     hint = f"write at least {smallest}; or infinity for no limit"
-    return _refusal(f"{quoted(text)} as a limit of {what}", hint)
+    return usage_error(f"cannot use {quoted(text)} as a limit of {what}", hint)
 
 
 def parse_tasks(text: str) -> int:
@@ -78,7 +78,7 @@ def parse_weight(text: str) -> int:
 
 def _parse_number(text: str, lowest: int, highest: int, what: str, hint: str) -> int:
     if not _NUMBER.fullmatch(text.strip()) or not lowest <= int(text) <= highest:
-        raise _refusal(f"{quoted(text)} as {what}", hint)
+        raise usage_error(f"cannot use {quoted(text)} as {what}", hint)
     return int(text)
 
 
@@ -89,10 +89,6 @@ def _plain_file(value: int) -> str:
 def _quota_file(share: int) -> str:
     """cpu.max: quota and period in µs."""
     return f"{'max' if share == INFINITY else share * _PERIOD // SECOND} {_PERIOD}"
-
-
-def _weight_file(weight: int) -> str:
-    return f"default {weight}"
 
 
 class Limit(NamedTuple):
@@ -118,7 +114,7 @@ LIMITS = (
     Limit("swap_limit", "MemorySwapMax", "memory.swap.max", parse_size, format_size),
     Limit("tasks_limit", "TasksMax", "pids.max", parse_tasks),
     Limit("cpu_weight", "CPUWeight", "cpu.weight", parse_weight),
-    Limit("io_weight", "IOWeight", "io.weight", parse_weight, file_text=_weight_file),
+    Limit("io_weight", "IOWeight", "io.weight", parse_weight, file_text="default {}".format),
     Limit(CPUS, "AllowedCPUs", "cpuset.cpus", parse_cpus, format_cpus, cpus_file),
 )
 BY_KEY: Mapping[str, Limit] = {limit.key: limit for limit in LIMITS}
@@ -174,7 +170,3 @@ def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Ite
             hint = "limit what it is started with"
             reason = "it is dynamic, so it does not run inside the dataflow's unit"
             raise bad_input(f"cannot limit the node {quoted(one.node)}: {reason}", hint)
-
-
-def _refusal(what: str, hint: str) -> DoraSystemdError:
-    return usage_error(f"cannot use {what}", hint)

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
+from dora_systemd.errors import bad_input, usage_error
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import quoted
 
@@ -39,7 +39,7 @@ def parse_scheduling(given: str) -> str:
     hint = f"write {policy}:PRIORITY with 1 to 99, such as {policy}:50"
     if policy not in REALTIME:
         hint = did_you_mean(policy, _SHARING) or f"valid values: {', '.join(_POLICIES)}"
-    raise _refusal(f"{quoted(given)} as scheduling", hint)
+    raise usage_error(f"cannot use {quoted(given)} as scheduling", hint)
 
 
 def parse_nice(given: str) -> int:
@@ -57,12 +57,8 @@ def parse_oom(given: str) -> int:
 def _parse_integer(given: str, lowest: int, highest: int, what: str, hint: str) -> int:
     text = given.strip()
     if not _INTEGER.fullmatch(text) or not lowest <= int(text) <= highest:
-        raise _refusal(f"{quoted(given)} as {what}", hint)
+        raise usage_error(f"cannot use {quoted(given)} as {what}", hint)
     return int(text)
-
-
-def _refusal(what: str, hint: str) -> DoraSystemdError:
-    return usage_error(f"cannot use {what}", hint)
 
 
 def is_realtime(scheduling: str) -> bool:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from typing import Any
 
 from dora_systemd.decisions.cell.machines import Placed, members_of
@@ -36,17 +37,13 @@ class DoraLines:
     """
 
     def __init__(self, form: str, uuid: str, is_terminal: bool) -> None:
-        self._form = _compact if form == "compact" else _json
+        self._form = _compact if form == "compact" else partial(json.dumps, separators=(",", ":"))
         self._uuid = uuid
         self._is_terminal = is_terminal
 
     def record(self, record: Record) -> bytes:
         line = self._form(log_payload(record, self._uuid)).encode()
         return (shown_log(line) if self._is_terminal else line) + b"\n"
-
-
-def _json(payload: Mapping[str, Any]) -> str:
-    return json.dumps(payload, separators=(",", ":"))
 
 
 def _compact(payload: Mapping[str, Any]) -> str:

@@ -262,7 +262,8 @@ def _words(
     yield f"--uuid={options.uuid}"
     yield from [f"--head={options.head}"] if options.head else []
     yield from (f"--placed={'='.join(one)}" for one in options.placed)
-    yield from (f"--address={one}" for one in _own_first(options.addresses, machine.address))
+    own_first = sorted(options.addresses, key=lambda one: one != machine.address)
+    yield from (f"--address={one}" for one in own_first)
     nodes = [one.node for one in options.placed if one.machine == machine.name]
     yield from (f"--{SET}={format_setting(one)}" for one in _passed_on(options.settings, nodes))
     given = [(one, settings[one]) for one in _SHARED if settings.is_given(one)]
@@ -283,10 +284,6 @@ def _passed_on(settings: Sequence[SettingText], nodes: Sequence[str]) -> Iterato
         is_for_them = one.node in nodes or (not one.node and setting.per_node)
         if is_for_them and setting.on_members:
             yield one
-
-
-def _own_first(addresses: Sequence[str], own: str) -> list[str]:
-    return sorted(addresses, key=lambda one: one != own)
 
 
 def _flags(setting: Setting[Any], value: Any) -> Iterator[str]:

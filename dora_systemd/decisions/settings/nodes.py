@@ -62,7 +62,7 @@ def _from_texts(texts: Iterable[str], known: _Known) -> dict[str, dict[str, Any]
         node, _, assignments = text.partition(":")  # node ids have no colon
         if not node or not assignments:
             hint = "write NODE:KEY=VALUE,KEY=VALUE, such as camera:memory_limit=1G,cpu_limit=1.5"
-            raise _refusal(f"{quoted(text)} as settings of a node", hint)
+            raise usage_error(f"cannot use {quoted(text)} as settings of a node", hint)
         values = found.setdefault(node, {})
         for key, value in _assignments(node, assignments, known):
             is_list = known[key].of_node().is_repeatable
@@ -83,7 +83,7 @@ def _assignments(node: str, text: str, known: _Known) -> Iterator[Sequence[str]]
             found.append([key, value])
         else:
             what = f"{quoted(part)} as a setting of the node {quoted(node)}"
-            raise _refusal(what, _hint(key, (*known, *inner)))
+            raise usage_error(f"cannot use {what}", _hint(key, (*known, *inner)))
     yield from found
 
 
@@ -93,10 +93,6 @@ def _hint(key: str, known: Sequence[str]) -> str:
     if len(known) > _MANY:
         return did_you_mean(key, known) or "dora-systemd.yml(5) lists the keys"
     return did_you_mean(key, known) or f"valid keys: {', '.join(known)}"
-
-
-def _refusal(what: str, hint: str) -> DoraSystemdError:
-    return usage_error(f"cannot use {what}", hint)
 
 
 def _texts(nodes: Nodes, known: _Known) -> Iterator[str]:
