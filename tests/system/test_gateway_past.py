@@ -136,6 +136,7 @@ def test_what_lives_have_used_before_the_page_was_opened(
     look(browser, "before")
     browser.resize(*PHONE, is_phone=True)
     browser.wait_js("document.documentElement.scrollWidth === 320")
+    look(browser, "before-phone")
     assert browser.failures() == []
 
 
@@ -213,6 +214,13 @@ def test_bundles_are_listed_and_downloaded(
         assert front.get(f"/bundles/{cell.name}/../../x").status == 404
         browser.wait_js(f"{THINGS}.some((one) => one.includes('is written'))")
         look(browser, "bundles")
+        # Without a pointer: the button, then the bundle.
+        browser.js("document.querySelector('#detail [data-action=bundle]').focus(), 0")
+        browser.press("Tab")
+        assert browser.js("document.activeElement.textContent") == path.name
+        browser.resize(*PHONE, is_phone=True)
+        browser.wait_js("document.documentElement.scrollWidth === 320")
+        look(browser, "bundles-phone")
     finally:
         shutil.rmtree(STORE / cell.name, ignore_errors=True)
     assert browser.failures() == []
