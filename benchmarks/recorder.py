@@ -49,9 +49,11 @@ def flow(project: Project) -> Path:
 
 def turn(cell: Cell, costs: list[tuple[float, float]], setting: str) -> list[float]:
     """µs on the way of each stream, with the recorder on or off."""
-    cell.doractl("set", cell.name, "--record", setting)
-    is_on = setting != "off"
-    wait_for("the recorder", lambda: bool(cell.pids(RECORDER)) == is_on)
+    cell.doractl("set", cell.name, "--record", "off")
+    wait_for("the last recorder ends", lambda: not cell.pids(RECORDER))
+    if is_on := setting != "off":
+        cell.doractl("set", cell.name, "--record", setting)
+        wait_for("the recorder", lambda: cell.pids(RECORDER))
     time.sleep(2)  # its first seconds are a start
     begins = {size: count(size) for size, _ in STREAMS.values()}
     before = [cpu_seconds(pid) for pid in cell.pids(RECORDER)]
