@@ -3,13 +3,14 @@
 import json
 import shutil
 
+from tests.deb.packages import install
 from tests.platforms import test_packages, test_uv
 from tests.platforms.enabled import NOTES, USERS, doractl, project_of, row
 from tests.system.cells import Project, wait_for
 
 
 def test_a_life_until_the_reboot() -> None:
-    test_packages.install()
+    install()
     test_uv.install_by_uv()
     notes = {}
     for user in USERS:

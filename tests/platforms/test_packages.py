@@ -232,9 +232,10 @@ def test_a_notice_of_a_failure(user: str, flow: Path) -> None:
     listed = json.loads(doractl(user, "list", "robot", "-o", "json").stdout)
     (pid,) = [one["pid"] for one in listed["nodes"] if one["node"] == "sink"]
     run("kill", "-KILL", str(pid))
-    text = wait_for("the notice", lambda: (place / "notice").exists() and (place / "notice"))
-    assert "DORA_NOTICE_EVENT=node-given-up\n" in text.read_text()
-    assert "DORA_NOTICE_NODE=sink\n" in text.read_text()
+    notice = place / "notice"
+    wait_for("the notice", notice.exists)
+    assert "DORA_NOTICE_EVENT=node-given-up\n" in notice.read_text()
+    assert "DORA_NOTICE_NODE=sink\n" in notice.read_text()
 
 
 def recorded(bundle: Path) -> list[int]:
