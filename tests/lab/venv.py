@@ -87,19 +87,6 @@ def write_skeleton(venv: Path) -> Path:
     return skeleton
 
 
-def write_package(venv: Path) -> Path:
-    """The packages where their names say they are, for mypy, which does not ask setuptools."""
-    place = venv / "package"
-    shutil.rmtree(place, ignore_errors=True)
-    package = place / "dora_systemd"
-    package.mkdir(parents=True)
-    for path in (definition.CHECKOUT / "dora_systemd").iterdir():
-        (package / path.name).symlink_to(path)
-    (package / "cli").symlink_to(definition.CHECKOUT / "cli")
-    (place / "lab").symlink_to(definition.HERE)
-    return place
-
-
 def remove_old(cache: Path, venv: Path) -> None:
     found = [path for path in cache.glob("venv-*") if path != venv]
     found.sort(key=lambda path: path.stat().st_mtime, reverse=True)

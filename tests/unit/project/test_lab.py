@@ -270,8 +270,7 @@ def test_steps_that_run_at_the_same_time(capfd: pytest.CaptureFixture[str], tmp_
     assert capfd.readouterr().out.splitlines()[:3] == ["a", "restb", "restlast"]
 
 
-# The plan of the linters builds a venv, and its steps follow each other.
-@pytest.mark.parametrize("what", [name for name in PLANS if name != "lint"])
+@pytest.mark.parametrize("what", PLANS)
 def test_a_step_waits_for_steps_before_it(what: str) -> None:
     steps = PLANS[what]("container")
     known: set[str] = set()
