@@ -51,6 +51,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
+from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sockets import TABLES, listening_sockets
 from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
@@ -62,7 +63,7 @@ from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.logins import PASSWD, is_lingering, judge_logins, linger_command
-from dora_systemd.verbs.start.programs import version_trouble_of
+from dora_systemd.verbs.start.programs import unreadable_file, version_trouble_of
 from dora_systemd.verbs.start.read import config_files
 from dora_systemd.verbs.start.settings import check_config
 from dora_systemd.verbs.start.where import DEFAULT_USER
@@ -338,12 +339,18 @@ def _user(scope: Scope, _root: Path) -> Iterator[Finding]:
     if scope.is_user:
         return
     try:
-        pwd.getpwnam(DEFAULT_USER)
+        entry = pwd.getpwnam(DEFAULT_USER)
     except KeyError:
         text = f"there is no user {DEFAULT_USER} to run the dataflows of root's files"
         yield Finding("user", State.NOTE, text, "doractl setup, or start them with --uid")
+        return
+    text = f"{DEFAULT_USER} runs the dataflows of root's files"
+    if closed := unreadable_file(account_from(entry)):
+        remedy = f"see namei -l {closed}: chmod -R a+rX what is closed, such as pip makes it"
+        remedy += " with umask 077, or install where all users can read"
+        yield Finding("user", State.PROBLEM, f"{text}, and cannot read {closed}", remedy)
     else:
-        yield Finding("user", State.OK, f"{DEFAULT_USER} runs the dataflows of root's files")
+        yield Finding("user", State.OK, text)
 
 
 def _settings(scope: Scope, root: Path) -> Iterator[Finding]:

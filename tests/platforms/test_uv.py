@@ -163,3 +163,22 @@ def test_pip_as_root(by_pip: Path) -> None:
     assert (shown["python"].startswith(HERE.python), shown["dora"]) == (True, "1.1.0")
     assert "Dataflow disabled: " in as_root(f"{DORACTL} disable robot").stdout
     assert "Dataflow stopped: " in as_root(f"{DORACTL} stop robot").stdout
+
+
+@pytest.mark.skipif(HERE.python == "3.11", reason="its setuptools needs wheel, which PyPI has")
+def test_pip_with_a_umask_that_closes_what_it_installs(by_pip: Path) -> None:
+    """The user dora executes neither Python nor doractl there; doctor says so before a start."""
+    del by_pip
+    for line in block_below("As root, with pip:"):
+        as_root(f"umask 077; {line}")
+    place = Path(DORACTL).parents[1]
+
+    def user() -> dict[str, str]:
+        found = json.loads(as_root(f"{DORACTL} doctor -o json", check=False).stdout)
+        return dict(next(one for one in found if one["topic"] == "user"))
+
+    for closed in (place / "bin", place / "lib"):
+        assert user()["state"] == "problem"
+        assert f"cannot read {closed}/" in user()["text"]
+        as_root(f"chmod a+rX {place}; chmod -R a+rX {closed}")
+    assert user()["state"] == "ok"

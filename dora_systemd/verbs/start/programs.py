@@ -7,14 +7,16 @@ in another user's home, or on the machine that the project was copied from.
 import os
 import pwd
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path, PurePath
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import OLDEST_DORA, version_numbers
 from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
-from dora_systemd.trust.programs import account_from
+from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.trust.sight import Sight, sight_of
 from dora_systemd.values import shown
 from dora_systemd.verbs.facts.cells import Cell
@@ -146,6 +148,31 @@ def _barrier(path: str, sight: Sight) -> str:
     """The last directory on the way to `path` that the account sees; it cannot enter that one."""
     parents = (str(one) for one in PurePath(path).parents)
     return next((one for one in parents if sight.exists(one)), "/")
+
+
+_IMPORTED = ("dora_systemd", "click", "websockets", "yaml")
+"""The packages of Python without which neither doractl nor a runner starts."""
+
+
+def unreadable_file(account: Account) -> str:
+    """The first file of this installation that an account cannot read; "" if it can read all."""
+    specs = (find_spec(one) for one in _IMPORTED)
+    files = [one.origin for one in specs if one and one.origin]
+    try:
+        with sight_of(account) as sight:
+            return first_unreadable(files, sight)
+    except DoraSystemdError:
+        return sys.executable
+
+
+def first_unreadable(files: Iterable[str], sight: Sight) -> str:
+    """The first of the files that an account cannot read, or ""."""
+    for one in files:
+        try:
+            sight.head(one)
+        except OSError:
+            return one
+    return ""
 
 
 def daemon_dora(dora: str, sight: Sight) -> str:

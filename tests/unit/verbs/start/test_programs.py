@@ -13,14 +13,17 @@ from typing import Any
 import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight
 from dora_systemd.verbs.start.programs import (
     check_program,
     daemon_dora,
     elf_machine,
+    first_unreadable,
     is_for,
     python_directories,
     script_interpreter,
+    unreadable_file,
     version_trouble,
     wheel_version,
 )
@@ -215,3 +218,11 @@ def test_the_version_of_a_wheel() -> None:
     for bad in ("dora_rs-1.0.dist-info\x1b", "dora_rs-1." + "9" * 99, "dora_rs-1.0.1"):
         assert wheel_version([bad], "dora_rs") == ""
     assert python_directories(["python3.13", "python3.13t", "python3", "x"]) == ["python3.13"]
+
+
+def test_what_an_account_cannot_read_of_this_installation() -> None:
+    files = ("/opt/x/bin/a", "/opt/x/lib/b", "/opt/x/lib/c")
+    disk = Disk(dict.fromkeys(files, b""), closed=("/opt/x/lib",))
+    assert first_unreadable(files, disk) == "/opt/x/lib/b"
+    assert first_unreadable(files[:1], disk) == ""
+    assert unreadable_file(own_account()) == ""
