@@ -158,7 +158,7 @@ def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
     try:
         result = group.main(arguments, prog_name="doractl", standalone_mode=False)
     except click.ClickException as error:
-        raise _usage_error(error) from error
+        raise _usage_error(error, arguments) from error
     except click.Abort:
         return ExitCode.INTERRUPTED
     except SystemExit as error:
@@ -187,10 +187,12 @@ def _near(error: click.NoSuchOption) -> list[str]:
     return []
 
 
-def _usage_error(error: click.ClickException) -> DoraSystemdError:
+def _usage_error(error: click.ClickException, arguments: list[str]) -> DoraSystemdError:
     text = error.format_message().rstrip(".")
     context: Any = getattr(error, "ctx", None)
-    command = context.command_path if context else "doractl"
+    # An option without its value has none.
+    verb = next((one for one in arguments if one in VERBS), "")
+    command = context.command_path if context else f"doractl {verb}".strip()
     possible = _near(error) if isinstance(error, click.NoSuchOption) else []
     hint = f"did you mean {' or '.join(sorted(possible))}?" if possible else f"see {command} --help"
     if isinstance(error, click.MissingParameter):

@@ -100,6 +100,7 @@ def test_one_that_has_ended(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     cell.doractl("stop", cell.name)
     wait_for("it is gone", lambda: cell.is_gone)
+    assert cell.doractl("reset", cell.name, check=False).returncode == ExitCode.NOT_RUNNING
     listed = found(cell, "list", cell.name, status=ExitCode.NOT_RUNNING)
     why = found(cell, "why", cell.name)
     told = {key: value for key, value in listed.items() if value is not None}

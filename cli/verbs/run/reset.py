@@ -33,8 +33,10 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
     scope = current_scope()
     bus = Bus(scope)
     cells = read_cells(bus)
-    named = (one.loaded(cells) for one in selectors_of(selectors, cells))
-    chosen = proven(cells) if want_all else list(named)
+    chosen = proven(cells) if want_all else []
+    for one in selectors_of(selectors, cells):
+        with one.telling_ended(scope):
+            chosen.append(one.loaded(cells))
     if want_all and not chosen:
         tell("No dataflow.")
     return print_outcomes(reset_cells(bus, scope, list(dict.fromkeys(chosen))))

@@ -59,6 +59,7 @@ class _Recorded(NamedTuple):
 
 
 _WORDS = {"CURRENT": 0, "PREVIOUS": 1}
+"""Of --run, in capitals or not; dora's ids of runs have digits."""
 _OFFSET = re.compile("-?0|-[1-9][0-9]{0,3}")
 
 
@@ -143,16 +144,17 @@ def _no_node(pattern: str, names: Sequence[str], known: Sequence[str]) -> DoraSy
 
 def _runs_before(run: str) -> int | None:
     """Parse an offset of runs before the last, as in `journalctl --boot`; None for an id."""
-    return -int(run) if _OFFSET.fullmatch(run) else _WORDS.get(run)
+    return -int(run) if _OFFSET.fullmatch(run) else _WORDS.get(run.upper())
 
 
 def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
-    if run == "ALL":
+    if run.upper() == "ALL":
         return query
     index = _runs_before(run)
     if index is None:
         if run and not journal.has_run(query.scope, query.name, run):
-            hint = "doractl list --all, or journalctl --field=DORA_RUN"
+            hint = f"doractl logs {query.name or 'NAME'} --events shows when each run began; "
+            hint += "valid values: CURRENT, PREVIOUS, -2 ..., ALL, an id (DORA_RUN)"
             raise DoraSystemdError(f"cannot find the run {quoted(run)}", hint, ExitCode.NOT_FOUND)
         return replace(query, run=run)
     if not query.name:
@@ -161,7 +163,7 @@ def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
     lives = journal.invocations(query.scope, query.name, query.uuid)
     invocation = next(islice(lives, index, None), None)
     if invocation is None:
-        which = f"{run.lower()} run" if run in _WORDS else f"run {run}"
+        which = f"{run.lower()} run" if run.upper() in _WORDS else f"run {run}"
         message = f"cannot find the {which} of dataflow {query.name}"
         raise DoraSystemdError(message, "--run ALL shows all there is", ExitCode.NOT_FOUND)
     return replace(query, invocation=invocation)

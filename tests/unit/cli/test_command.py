@@ -140,6 +140,7 @@ def test_every_option_says_what_it_does(name: str) -> None:
         (["stop"], "cannot stop: give names or --all", "doractl stop NAME, or doractl stop --all"),
         (["stop", "x", "--all"], "cannot stop: give names or --all", ""),
         (["show"], "missing argument", "see doractl show --help"),
+        (["start", "--watch"], "option '--watch' requires an argument", "see doractl start --help"),
         (["list", "a", "b"], "got unexpected extra", ""),
         (["list", "-o", "xml"], "invalid value", ""),
         (["list", "--last", "0"], "invalid value", ""),

@@ -173,13 +173,15 @@ def test_unknown_node_lists_the_known_ones() -> None:
 
 def test_run() -> None:
     assert find(run="CURRENT").invocation == "i2"
-    assert find(run="PREVIOUS").invocation == "i1"
+    assert find(run="PREVIOUS").invocation == find(run="previous").invocation == "i1"
+    assert find(run="all") == find()
     assert [find(run=one).invocation for one in ("0", "-1")] == ["i2", "i1"]
     with pytest.raises(DoraSystemdError, match="cannot find the run -7 of dataflow"):
         find(run="-7")
     for other in ("1", "-", "-01", "-x"):
-        with pytest.raises(DoraSystemdError, match=f"cannot find the run '{other}'"):
+        with pytest.raises(DoraSystemdError, match=f"cannot find the run '{other}'") as refused:
             find(run=other)
+        assert refused.value.hint.startswith("doractl logs robot --events shows when each")
     assert find(run="0190-run").run == "0190-run"
     for selector, run in (("arm", "CURRENT"), ("arm", "0190-run"), ("robot", "nosuch")):
         with pytest.raises(DoraSystemdError, match="cannot find the") as caught:
