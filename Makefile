@@ -44,6 +44,10 @@ faults:  ## every fault of tests/system/faults, ROUNDS=n times
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@ROUNDS=$(ROUNDS) $(CHECK) faults
 
+transcripts:  ## tasks as a person types them, and what is shown; LAB=forky: with the packages
+	@$(PREPARE) container
+	@$(CHECK) transcripts
+
 history:  ## commands and faults in combination; SEED=n STEPS=n HOURS=n, LAB_OUT=DIR keeps records
 	@$(PREPARE) $(if $(filter vm machines,$(LAB)),container $(LAB),container)
 	@SEED=$(SEED) STEPS=$(STEPS) HOURS=$(HOURS) $(CHECK) history
@@ -152,4 +156,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit other-python lab packages system quick vm emulator faults history stops power fuzz mutants browser openarm machines bench bench-quick bench-platforms bookworm forky arm64 canary lint demo clean deb wheels autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm emulator faults transcripts history stops power fuzz mutants browser openarm machines bench bench-quick bench-platforms bookworm forky arm64 canary lint demo clean deb wheels autopkgtest

@@ -26,6 +26,9 @@ MUTMUT = "mutmut==3.8.1"
 # xdist would name its processes with it, and some tests look at their own command line.
 NOT_WITH_MUTMUT = "setproctitle"
 FAULTS = "tests/system/faults"
+TRANSCRIPTS = "tests/system/transcripts"
+# What `make test` types of them on other releases of Debian.
+TYPED = [f"{TRANSCRIPTS}/test_transcripts.py::test_task[{one}]" for one in ("first-start", "typo")]
 # System tests that need no image or kernel of their own.
 IN_CONTAINER = "not vm and not emulator and not openarm"
 # Containers at the same time. Most of the time of a test is waiting, and one more than three makes
@@ -45,7 +48,7 @@ WITH_TOOLS = (
 # Stops between two restarts of a machine, which come after other kinds of stops each time.
 STAGE = 9
 # What `make test` runs on the next Debian: what differs there.
-NEW = "versions or doctor or units or life or newer or account or ordinary or pip"
+NEW = "versions or doctor or units or life or newer or account or ordinary or pip or task"
 # Far more than any test takes: one that hangs fails and shows where, and the others run.
 PYTEST = ("pytest", "--timeout=900")
 # A dataflow as a service, from start to stop: what to run after every change.
@@ -187,7 +190,8 @@ def packages_step() -> Step:
 def plan_platform(_form: str, suite: str) -> list[Step]:
     """Another release of Debian, where apt installs the packages, and uv wheels."""
     built = [build_step(), wheels_step()]
-    step = platform_step(suite, "tests/deb/test_deb.py", minutes=4)
+    more = (f"tests/deb/test_{name}.py" for name in ("deb", "first_block"))
+    step = platform_step(suite, *more, minutes=4)
     return [*built, replace(step, after=tuple(one.name for one in built))]
 
 
@@ -198,9 +202,11 @@ def wheels_step() -> Step:
 def platform_step(suite: str, *options: str, minutes: int = 1) -> Step:
     """What users install there, and after a reboot what they have enabled."""
     place = "tests/platforms"
-    # Not the folder: pytest drops a file that is named beside its folder.
-    files = sorted(str(one.relative_to(CHECKOUT)) for one in (CHECKOUT / place).glob("test_*.py"))
-    before = [*files, f"{place}/before_reboot.py", *options]
+    # Not the folder: pytest drops a file that is named beside its folder. test_uv.py removes the
+    # packages, which the transcripts need.
+    names = {str(one.relative_to(CHECKOUT)) for one in (CHECKOUT / place).glob("test_*.py")}
+    files = sorted(names, key=lambda one: (not one.endswith("test_uv.py"), one))
+    before = [*files, *TYPED, *options, f"{place}/before_reboot.py"]
     step = lab_step(f"tests on Debian {suite}", suite, before, minutes)
     after = ["--reboot--", *PYTEST, f"{place}/after_reboot.py"]
     return replace(step, command=[*step.command, *after])
@@ -258,6 +264,15 @@ def plan_faults(form: str) -> list[Step]:
     command += ["pytest", FAULTS, "-m", marks]
     step = Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))
     return [*packages_for(form), step]
+
+
+def plan_transcripts(form: str) -> list[Step]:
+    """What a person types; on another Debian, with the packages."""
+    where = form if form in PLATFORMS else "container"
+    command = ["tests/lab/lab", "run", "--", *installed(where), *PYTEST, TRANSCRIPTS]
+    words = [*command, "-m", IN_CONTAINER]
+    step = Step(f"transcripts, {where}", words, in_lab(where), minutes=2)
+    return [*packages_for(where), step]
 
 
 def plan_history(form: str) -> list[Step]:
@@ -392,6 +407,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "system": plan_system,
     "quick": plan_quick,
     "faults": plan_faults,
+    "transcripts": plan_transcripts,
     "history": plan_history,
     "stops": plan_stops,
     "kills": plan_kills,
