@@ -22,9 +22,9 @@ VERBS = (
     *("enable", "env", "export"),
     *("forget", "inhibit", "list", "logs", "machine", "member", "node", "releases", "reload"),
     *("reset", "restart", "rollback", "run", "set", "setup", "show", "start", "stop", "top"),
-    *("up", "version", "why"),
+    *("up", "version", "why", "ps", "status", "reset-failed"),
 )
-"""The verbs of group.py, whose import takes longer than most commands."""
+"""The verbs of group.py and their aliases, whose import takes longer than most commands."""
 
 
 class Edge(io.TextIOWrapper):
@@ -77,8 +77,10 @@ def with_host(text: str, host: str) -> str:
     """The text, in which commands of doractl are for that host; unchanged without one."""
     if not host or "doractl " not in text:
         return text
-    command = rf"\bdoractl (?=(?:--(?:system|user) )?(?:{'|'.join(VERBS)})\b)"
-    return re.sub(command, f"doractl -H {host} ", text)
+    verbs = "|".join(VERBS)
+    command = rf"(\bby \S+ \()?\bdoractl (?=(?:--(?:system|user) )?(?:{verbs})\b)"
+    # What a user has called there, as in "stopped by root (doractl stop)", stays.
+    return re.sub(command, lambda one: one[0] if one[1] else f"doractl -H {host} ", text)
 
 
 def _open_closed() -> None:
@@ -117,6 +119,11 @@ def write_own(stream: TextIO, text: str) -> None:
         stream.write_own(text)
     else:
         stream.write(text)
+
+
+def write_view(stream: TextIO, text: str) -> None:
+    """Write a table or a report, in which nothing but our own colours controls the terminal."""
+    write_own(stream, with_host(text, stream.reached_as) if isinstance(stream, Edge) else text)
 
 
 def write_exactly(text: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.edge import write_own
+from dora_systemd.cli.edge import write_view
 from dora_systemd.decisions.views.dataflows import format_dataflows, is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
@@ -215,7 +215,7 @@ def print_table(form: Callable[[int | None, bool], str]) -> None:
 
 def _print_view(text: str) -> None:
     """Print a text in which nothing but our own colours can control the terminal."""
-    write_own(sys.stdout, f"{text}\n")
+    write_view(sys.stdout, f"{text}\n")
 
 
 def _wants_colors() -> bool:

@@ -9,12 +9,13 @@ from typing import Any
 
 import click
 
+from dora_systemd.cli.edge import with_host
 from dora_systemd.cli.group import VerbGroup, doractl, run_verb
 from dora_systemd.cli.remote.plan import ROLLOUTS, Plan, check_hosts, plan_of, valued_flags
 from dora_systemd.cli.remote.run import is_terminal, pass_through, run_on_all, run_there
 from dora_systemd.decisions.remote.command_line import part_hosts
 from dora_systemd.decisions.remote.hosts import ALL, Host, given_words
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.paths import exists
 from dora_systemd.verbs.remote.hosts import find_hosts
 
@@ -35,6 +36,15 @@ def run_elsewhere(arguments: list[str]) -> int:
         def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
             command = super().get_command(ctx, cmd_name)
             return command and _with_callback(command, run)
+
+        def resolve_command(
+            self, ctx: click.Context, args: list[str]
+        ) -> tuple[str | None, click.Command | None, list[str]]:
+            try:
+                return super().resolve_command(ctx, args)
+            except DoraSystemdError as error:
+                hint = with_host(error.hint, ",".join(given))
+                raise DoraSystemdError(error.message, hint, error.code) from error
 
     return run_verb(words, _like(doractl, Elsewhere))
 

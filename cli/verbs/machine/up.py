@@ -5,6 +5,7 @@ import os
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.edge import Edge
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT, wanted_port
 from dora_systemd.decisions.views.outcome import Outcome, Thing
@@ -14,6 +15,9 @@ from dora_systemd.verbs.up import check_machine, make_state, open_port, start_bo
 _USE = """
 
 Use 'eval "$(doractl env)"' to connect the dora command to it"""
+_USE_THERE = """
+
+Use 'doractl dora NAME -- ARGUMENT...' to run the dora command there"""
 
 
 @click.command("up")
@@ -60,5 +64,6 @@ def _print_port(text: str, port: int, started: list[str] | None = None) -> int:
     url = f"http://localhost:{port}"
     details = {"port": port, "url": url, "started": started or []}
     is_news = started is not None
-    outcome = Outcome(Thing(SOCKET_UNIT), f"{text} at: {url}{_USE}", "", is_news, "", details)
+    use = _USE_THERE if Edge.reached_as else _USE
+    outcome = Outcome(Thing(SOCKET_UNIT), f"{text} at: {url}{use}", "", is_news, "", details)
     return print_outcomes([outcome])

@@ -30,7 +30,7 @@ def judge_core_pattern(
     pattern = pattern.strip()
     if is_container:
         text = "a crash of a node has no stack here: the core dumps of a container go to its host"
-        return Finding("core dumps", State.NOTE, text, "on the host: doractl doctor, coredumpctl")
+        return Finding("core dumps", State.NOTE, text, "coredumpctl on its host")
     if keeps_core_dumps(pattern):
         return _judge_coredump(is_there, config)
     if _APPORT.match(pattern):

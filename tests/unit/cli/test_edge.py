@@ -1,9 +1,11 @@
 """What doractl prints for somebody who has called it from another machine."""
 
+import io
+
 import pytest
 
 from dora_systemd.cli import edge, group
-from dora_systemd.cli.edge import with_host
+from dora_systemd.cli.edge import Edge, with_host, write_view
 
 
 @pytest.mark.parametrize(
@@ -14,6 +16,7 @@ from dora_systemd.cli.edge import with_host
         ("the same version of doractl on both", "the same version of doractl on both"),
         ("doractl: no dataflow named 'x'", "doractl: no dataflow named 'x'"),
         ("doractl -H c why x", "doractl -H c why x"),
+        ("stopped by root (doractl stop)", "stopped by root (doractl stop)"),
     ],
 )
 def test_commands_are_for_the_host_they_are_about(text: str, there: str | None) -> None:
@@ -23,4 +26,12 @@ def test_commands_are_for_the_host_they_are_about(text: str, there: str | None) 
 
 
 def test_all_verbs_are_known() -> None:
-    assert set(edge.VERBS) == group.VERBS.keys()
+    assert set(edge.VERBS) == {*group.VERBS, *group.ALIASES}
+
+
+def test_a_report_for_another_host() -> None:
+    stream = Edge(io.BytesIO(), encoding="utf-8")
+    stream.reached_as = "a@b:7"
+    write_view(stream, "\x1b[1mfix x, then run: doractl restart x\x1b[0m\n")
+    stream.seek(0)
+    assert stream.read() == "\x1b[1mfix x, then run: doractl -H a@b:7 restart x\x1b[0m\n"

@@ -172,6 +172,12 @@ def test_wrong_command_lines(words: str, message: str, capsys: Printed, programs
     assert not programs.exists()
 
 
+def test_a_command_of_another_tool_is_meant_there(capsys: Printed, programs: Path) -> None:
+    del programs
+    main.run(["-H", "h1", "rm", "x", "--host=h2"])
+    assert "did you mean doractl -H h1,h2 stop?" in capsys.readouterr().err
+
+
 def test_help_is_ours(capsys: Printed, programs: Path) -> None:
     assert main.run(["-H", "h1", "list", "--help"]) == 0
     assert "-H, --host" in capsys.readouterr().out
