@@ -73,8 +73,9 @@ def test_a_launcher_that_moves_meanwhile_is_found(tmp_path: Path) -> None:
         return Nodes(tmp_path, CellPaths(tmp_path), pipes).has_process("a", 8)
 
     assert asyncio.run(find())
-    os.close(os.open(own, os.O_RDONLY | os.O_NONBLOCK))
+    reader = os.open(own, os.O_RDONLY | os.O_NONBLOCK)  # it may not have opened its end yet
     moving.join()
+    os.close(reader)
 
 
 def test_a_node_that_dora_reads_is_removed_and_taken_back(tmp_path: Path) -> None:
