@@ -51,6 +51,8 @@ STAGE = 9
 NEW = "versions or doctor or units or life or newer or account or ordinary or pip or task"
 # Far more than any test takes: one that hangs fails and shows where, and the others run.
 PYTEST = ("pytest", "--timeout=900")
+# A unit test that hangs holds up its whole step, and none takes a tenth of this.
+UNIT = ("pytest", "--timeout=300", "tests/unit")
 # A dataflow as a service, from start to stop: what to run after every change.
 QUICK = (
     *("cell", "start", "bus", "lab", "stop", "list", "kinds"),
@@ -125,7 +127,7 @@ def unit_step(options: Sequence[str]) -> Step:
     A worker that has no tests left takes over some of another's.
     """
     workers = str((os.cpu_count() or 1) + 1)
-    command = ["python", "-m", *PYTEST, "tests/unit", "-n", workers, "--dist=worksteal"]
+    command = ["python", "-m", *UNIT, "-n", workers, "--dist=worksteal"]
     version = ".".join(map(str, sys.version_info[:2]))
     return Step(f"unit tests, Python {version}", [*command, *options], in_venv, minutes=1)
 
