@@ -381,14 +381,12 @@ def test_stop_while_a_node_waits_for_the_journal(cell: Cell, project: Project, h
 @pytest.mark.lab
 @pytest.mark.warns("are lost", *LOST)
 def test_a_stop_ends_in_time_though_journald_hangs(cell: Cell, project: Project) -> None:
-    """It hears nothing any more; TimeoutStopSec= is 11.5 s, after which systemd would kill."""
+    """It receives nothing; after TimeoutStopSec=, 11.5 s, systemd would kill: a timeout."""
     project.write("flood.py", ENDLESS)
     flow = project.write("dataflow.yml", "nodes: [{id: n, path: flood.py}]")
     cell.start(flow, "--grace-duration", "1s")
     with without_journald():
-        begun = time.monotonic()
         cell.systemctl("stop")
-        assert time.monotonic() - begun < 11
         assert (cell.show("ActiveState"), cell.show("Result")) == ("inactive", "success")
 
 
