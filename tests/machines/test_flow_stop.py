@@ -132,7 +132,10 @@ def test_the_order_holds_across_machines(flow: Stops, request: pytest.FixtureReq
         flow.wait_records(3)
         with flow.held():
             stop = run_beside(lambda: flow.cell.doractl("stop", NAME))
-            wait_for("list has its status", lambda: _is_shown(row))
+            if (
+                flow.of("recorder") == "b"
+            ):  # tests/system/test_stop_order.py has one on this machine
+                wait_for("list has its status", lambda: _is_shown(row))
         assert stop().returncode == 0
         flow.check_whole(3)
         assert not flow.left()
@@ -140,6 +143,7 @@ def test_the_order_holds_across_machines(flow: Stops, request: pytest.FixtureReq
 
 def _is_shown(row: Callable[[], Mapping[str, Any]]) -> bool:
     (node,) = (one for one in row()["nodes"] if one["node"] == "recorder")
+    print(node["state"], node["pid"], node["text"], node["stop_left_us"])  # if it never is
     return node["text"] == "writing episode" and 0 < (node["stop_left_us"] or 0) < 60e6
 
 

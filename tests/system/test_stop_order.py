@@ -20,6 +20,7 @@ from tests.system.recorders import (
     episodes,
     flow,
     parts,
+    saved,
     start,
 )
 
@@ -97,12 +98,15 @@ def test_who_cannot_wait(cell: Cell, project: Project, how: str) -> None:
 
 @pytest.mark.lab
 def test_what_it_waits_for_is_shown(cell: Cell, project: Project) -> None:
-    start(cell, flow(project, seconds=10))
+    start(cell, flow(project))
+    hold = saved(project) / "hold"
+    hold.touch()
     with subprocess.Popen(["doractl", cell.scope.flag, "stop", cell.name]) as first:
         wait_for("it writes", lambda: parts(project))
         shown = wait_for("its status", lambda: _list_with(cell, "writing"))
         assert "Stopping (recorder: writing episode, " in shown
         assert "s left)" in shown
+        hold.unlink()
         first.wait(bound(40))
 
 
