@@ -39,7 +39,7 @@ def _cells(row: BundleRow) -> tuple[str, ...]:
 
 
 def _why(about: Manifest) -> str:
-    """What has failed; without a failure the state of the dataflow, and who has requested it."""
+    """What has failed. If nothing has: the state of the dataflow, and who requested the bundle."""
     if about.cause or about.event:
         return about.summary or UNKNOWN
     by = f"requested by {about.by}" if about.by else ""

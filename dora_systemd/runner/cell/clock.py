@@ -1,8 +1,8 @@
 """Time in a cell: the clock of a stop, lost time, and the messages to the watchdog of systemd.
 
-While nothing happens, the process wakes up only at the ticks. There are two ticks within
-WatchdogSec=, and dora's answer to each tick wakes the process once more. Before Python 3.13 each
-tick also wakes the thread of the watchdog.
+While nothing happens, the process wakes up twice for each tick: at the tick, and when dora answers.
+There are two ticks within WatchdogSec=. Before Python 3.13, the thread of the watchdog wakes up at
+each tick as well.
 """
 
 import asyncio
