@@ -90,11 +90,7 @@ def boot_figure(flow: Path, rounds: int) -> Figure:
         warm_up()
     what = f"{AT_BOOT} dataflows in one transaction, until all nodes are ready"
     figure = alternate(what, "s", measures, rounds, goal="≤ 1.2 × units by hand")
-    run(
-        "doractl",
-        "disable",
-        *(unit.removeprefix("dora-").removesuffix(".service") for unit in ours),
-    )
+    run("doractl", "disable", *ours)
     return figure
 
 

@@ -19,7 +19,7 @@ from dora_systemd.decisions.bundles.manifest import (
     no_bundle,
     parse_manifest,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.trust.eyes import check_regular
 from dora_systemd.trust.files import unreadable
 from dora_systemd.values import shown
@@ -81,7 +81,7 @@ class Bundle:
 
     def _changed(self, reason: str) -> DoraSystemdError:
         message = f"cannot use {shown(str(self._path))}: it was changed: {reason}"
-        return DoraSystemdError(message, "copy it again", ExitCode.BAD_INPUT)
+        return bad_input(message, "copy it again")
 
 
 @contextmanager
@@ -138,4 +138,4 @@ def _parsed(path: Path, header: bytes, is_first: bool) -> tuple[str, int]:
 
 def _was_cut(path: Path, reason: str) -> DoraSystemdError:
     message = f"cannot read {shown(str(path))}: it was cut: {reason}"
-    return DoraSystemdError(message, "copy it again", ExitCode.BAD_INPUT)
+    return bad_input(message, "copy it again")

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.values import as_list, as_mapping, format_moment, shown
 
 KIND = "dora-systemd bundle"
@@ -98,7 +98,7 @@ def parse_manifest(data: bytes, source: str) -> Manifest:
         raise no_bundle(source, "its manifest.json is of something else")
     if schema > SCHEMA:
         message = f"cannot read {shown(source)}: a newer doractl has written it (schema {schema})"
-        raise DoraSystemdError(message, "use that version of doractl", ExitCode.BAD_INPUT)
+        raise bad_input(message, "use that version of doractl")
     try:
         return _parsed(values)
     except (ValueError, TypeError, KeyError) as error:
@@ -108,7 +108,7 @@ def parse_manifest(data: bytes, source: str) -> Manifest:
 def no_bundle(source: str, reason: str) -> DoraSystemdError:
     """The error for a file that is no bundle."""
     message = f"cannot read {shown(source)} as a bundle: {reason}"
-    return DoraSystemdError(message, "doractl bundle NAME writes one", ExitCode.BAD_INPUT)
+    return bad_input(message, "doractl bundle NAME writes one")
 
 
 def _parsed(values: Mapping[str, Any]) -> Manifest:

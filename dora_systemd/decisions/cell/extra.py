@@ -3,8 +3,11 @@
 `PROBE` and `RECORDER` are their names: the cgroup is node-NAME, and dora's id has it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+from dora_systemd.errors import bad_input
+from dora_systemd.values import quoted
 
 PROBE = "dora-systemd-probe"
 """Receives the outputs that are owed, see decisions/owes/probe.py."""
@@ -24,6 +27,17 @@ def extra_id(name: str, number: int) -> str:
 def is_extra(node: str, name: str) -> bool:
     """Whether a node of this id is an added one, or would have the cgroup of one."""
     return node.removeprefix(_LAST).startswith(name)
+
+
+def check_ids(what: str, name: str, nodes: Iterable[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) if a node of the dataflow has the id of an added one.
+
+    what: the purpose of that, as in "record outputs". name: PROBE or RECORDER. nodes: their ids.
+    """
+    for one in nodes:
+        if is_extra(one, name):
+            message = f"cannot {what}: the node {quoted(one)} has a name that doractl needs"
+            raise bad_input(message, "give that node another id")
 
 
 def without_extra(nodes: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
-from dora_systemd.decisions.cell.extra import PROBE, is_extra
+from dora_systemd.decisions.cell.extra import PROBE, check_ids
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, given_policies, with_values
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
@@ -112,10 +112,9 @@ def owes_of(options: RunnerOptions) -> tuple[Owed, ...]:
 
 def base_of(policy: RestartPolicy, owes: Iterable[Owed], node: str) -> RestartPolicy:
     """The policy of a node without one of its own, from that of the dataflow."""
-    owes_restart = any(one.node == node and one.then == RESTART for one in owes)
-    return (
-        policy._replace(policy="on-failure") if policy.policy == "no" and owes_restart else policy
-    )
+    if policy.policy != "no" or not any(one.node == node and one.then == RESTART for one in owes):
+        return policy
+    return policy._replace(policy="on-failure")
 
 
 @lru_cache(maxsize=4)
@@ -150,9 +149,7 @@ def check_owes(
             hint = f"{_OTHER}, or another restart_policy"
             hint = _OTHER if node.kind in _NEVER_RESTARTED else hint
             raise bad_input(f"cannot restart the silent node {quoted(one.node)}: {reason}", hint)
-    for probe in (one for one in by_id if is_extra(one, PROBE)):
-        message = f"cannot watch outputs: the node {quoted(probe)} has a name that doractl needs"
-        raise bad_input(message, "give that node another id")
+    check_ids("watch outputs", PROBE, by_id)
 
 
 def _check_output(owed: Owed, node: Node) -> None:

@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import usage_error
 from dora_systemd.values import (
     INFINITY,
     SECOND,
@@ -106,7 +106,7 @@ def parse_choice(text: str) -> str:
     """The word of a policy. Raises DoraSystemdError (USAGE)."""
     if (word := text.strip()) not in POLICIES:
         message = f"cannot use {quoted(word)} as restart policy"
-        raise DoraSystemdError(message, f"valid values: {', '.join(POLICIES)}", ExitCode.USAGE)
+        raise usage_error(message, f"valid values: {', '.join(POLICIES)}")
     return word
 
 
@@ -115,7 +115,7 @@ def parse_window(text: str) -> int:
     window = parse_duration(text)
     if window == 0:
         message = f"cannot use {quoted(text)} as the window of restarts"
-        raise DoraSystemdError(message, "write a time such as 10min", ExitCode.USAGE)
+        raise usage_error(message, "write a time such as 10min")
     return window
 
 
@@ -124,10 +124,9 @@ def parse_count(text: str) -> int:
     if text.strip() == "infinity":
         return INFINITY
     if not _COUNT.fullmatch(text.strip()) or not 1 <= int(text) <= MAX_RESTARTS:
-        raise DoraSystemdError(
+        raise usage_error(
             f"cannot use {quoted(text)} as a number of restarts",
             "write 1 or more, or infinity; for none use --restart-policy no",
-            ExitCode.USAGE,
         )
     return int(text)
 
@@ -137,7 +136,7 @@ def parse_delay(text: str) -> int:
     delay = parse_duration(text)
     if delay == INFINITY:
         message = f"cannot use {quoted(text)} as the delay of a restart"
-        raise DoraSystemdError(message, "write a time such as 500ms, or 0 for none", ExitCode.USAGE)
+        raise usage_error(message, "write a time such as 500ms, or 0 for none")
     return delay
 
 
@@ -156,7 +155,7 @@ def with_values(base: RestartPolicy, values: Mapping[str, Any], node: str = "") 
             " ends a crash loop, which uses up the CPU"
         )
         hint = f"lower max_restarts, or use a restart_delay of {format_duration(DELAY)} or more"
-        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        raise usage_error(message, hint)
     return changed._replace(max_delay=max(changed.max_delay, changed.delay))
 
 

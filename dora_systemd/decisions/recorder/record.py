@@ -6,11 +6,11 @@ The setting is in decisions/settings/record.py.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from dora_systemd.decisions.cell.extra import RECORDER, is_extra
+from dora_systemd.decisions.cell.extra import RECORDER, check_ids
 from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import (
     INFINITY,
@@ -98,7 +98,7 @@ def _memory(text: str) -> int:
 
 
 def _wrong(reason: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot read what to record: {reason}", hint, ExitCode.USAGE)
+    return usage_error(f"cannot read what to record: {reason}", hint)
 
 
 def format_record(record: Record | None) -> str:
@@ -121,13 +121,11 @@ def check_record(record: Record | None, options: RunnerOptions, nodes: Sequence[
         # ros2 nodes get outputs from their topics.
         if name not in known and (node is None or node.kind is not NodeKind.ROS2):
             hint = did_you_mean(name, known) or f"outputs: {', '.join(known) or 'none'}"
-            raise _impossible(f"cannot record {quoted(name)}: no such output", hint)
+            raise bad_input(f"cannot record {quoted(name)}: no such output", hint)
         if machine := placed_on(options.placed, name.partition("/")[0]):
             hint = "only outputs of nodes on the machine of the dataflow's unit can be recorded"
-            raise _impossible(f"cannot record {quoted(name)}: it is on machine {machine}", hint)
-    for one in (one for one in by_id if is_extra(one, RECORDER)):
-        message = f"cannot record outputs: the node {quoted(one)} has a name that doractl needs"
-        raise _impossible(message, "give that node another id")
+            raise bad_input(f"cannot record {quoted(name)}: it is on machine {machine}", hint)
+    check_ids("record outputs", RECORDER, by_id)
 
 
 def check_memory(record: Record, total: int) -> None:
@@ -135,7 +133,7 @@ def check_memory(record: Record, total: int) -> None:
     if record.memory + ROOM > total:
         has = f"this machine has {format_size(total // MEGABYTE * MEGABYTE)}"
         own = f"{format_size(record.memory)} and {format_size(ROOM)} for the recorder"
-        raise _impossible(f"cannot record in {own}: {has}", "lower memory: of record")
+        raise bad_input(f"cannot record in {own}: {has}", "lower memory: of record")
 
 
 def limit_of(record: Record, total: int) -> int:
@@ -151,7 +149,3 @@ def recorded_outputs(
         return record.outputs
     here = (node for node in nodes if not placed_on(options.placed, node.id))
     return tuple(sorted(f"{node.id}/{output}" for node in here for output in node.outputs))
-
-
-def _impossible(message: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
