@@ -74,7 +74,7 @@ def measure(rounds: int) -> list[Figure]:
         whole = {one.name: one.daemon_pids() + one.dora_pids() for one in contestants}
         assert OURS in daemons
         figures = [
-            memory_figure(f"private memory, {OF_DAEMONS}", daemons, "≤ 16 MB"),
+            memory_figure(f"private memory, {OF_DAEMONS}", daemons, "≤ 13 MB"),
             memory_figure(f"private memory, {OF_ALL}", whole, ""),
             *cpu_figures({OF_DAEMONS: daemons, OF_ALL: whole}, rounds),
         ]

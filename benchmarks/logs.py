@@ -205,7 +205,7 @@ def measure(rounds: int, want_all: bool = True) -> list[Figure]:
     own = "writes to journald itself"
     lines = {OURS: partial(ours_in, project), own: partial(sender_in, project)}
     lines |= {"dora run": partial(dora_in, project)}
-    what, goal = "lines a second into the journal, one node", "≥ 60,000"
+    what, goal = "lines a second into the journal, one node", "≥ 0.95 × that service"
     figures = [alternate(what, "lines/s", lines, rounds, goal=goal)]
     figures.append(reading(project, "short", rounds))
     if want_all:

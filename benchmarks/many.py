@@ -7,9 +7,13 @@ from benchmarks.contestants import Contestant, Doractl, DoraRun, SystemdRun, pre
 from benchmarks.cost import private_mb
 from benchmarks.crowd import COUNTS, Crowd, crowd
 from benchmarks.flows import make_home
-from benchmarks.rounds import OURS, Figure, alternate, keep, shown
+from benchmarks.rounds import EMPTY, OURS, Figure, alternate, keep, shown
 from benchmarks.start import start_ms
 from benchmarks.startup import listings
+
+LISTS = {50: f"≤ 4.5 {EMPTY}", 200: f"≤ 12 {EMPTY}"}
+STARTS = {1: f"≤ 24 {EMPTY}"}
+"""Goals of numbers of dataflows."""
 
 
 def start_figure(contestants: list[Contestant], count: int, rounds: int) -> Figure:
@@ -17,7 +21,9 @@ def start_figure(contestants: list[Contestant], count: int, rounds: int) -> Figu
     measures = {one.name: partial(start_ms, one, 1) for one in contestants}
     for warm_up in measures.values():
         warm_up()
-    return alternate(f"start beside {count}", "ms", measures, rounds, goal="flat")
+    return alternate(
+        f"start beside {count}", "ms", measures, rounds, goal=STARTS.get(count, "flat")
+    )
 
 
 def memory_figure(all_of_them: Crowd, count: int) -> Figure:
@@ -37,7 +43,7 @@ def measure(rounds: int, counts: tuple[int, ...] = COUNTS) -> list[Figure]:
             commands = listings(everyone.rivals)
             for warm_up in commands.values():
                 warm_up()
-            about = {"goal": "50: ≤ 60 ms", "at": count}
+            about = {"goal": LISTS.get(count, ""), "at": count}
             lists.append(alternate(f"`list` of {count}", "ms", commands, rounds, **about))
             with prepared((Doractl, SystemdRun, DoraRun), everyone.flow) as contestants:
                 starts.append(start_figure(contestants, count, max(rounds // 2, 1)))

@@ -20,6 +20,9 @@ OURS = "doractl"
 ZENOH_MS = 300
 """The least difference of a round in which dora has waited for zenoh to one in which it has not."""
 
+EMPTY = "empty Pythons"
+"""A unit of goals: `python3 -c ''` in startup.py. Ratios to it hold on a slower machine, too."""
+
 OUT = Path("/out")
 """Where `LAB_OUT=DIR tests/lab/lab run` takes files out of the lab."""
 
