@@ -17,7 +17,7 @@ from dora_systemd.decisions.logs.journal_events import (
     STOPPING,
 )
 from dora_systemd.decisions.logs.query import UNIT_ENDS, UNIT_FAILED
-from dora_systemd.names import is_node_id, is_readable
+from dora_systemd.names import is_node_id, is_readable, is_uuid
 from dora_systemd.values import SECOND, format_duration, format_moment
 
 FAILED = "failed"
@@ -51,6 +51,7 @@ class Happened(NamedTuple):
     mono_us: int  # CLOCK_MONOTONIC
     node: str = ""
     cause: str = ""
+    uuid: str = ""  # of the dataflow, if the failure is FAILED and that is known
 
 
 class Sent(NamedTuple):
@@ -87,7 +88,7 @@ def read_story(
     last: the last notice, if that is known.
     """
     found: list[Happened] = []
-    causes: dict[str, tuple[str, str]] = {}
+    causes: dict[str, tuple[str, str, str]] = {}
     bound = last.until_us if last else now_us - LOOK_BACK
     for record in islice(records, MOST_RECORDS):
         mono_us = _number(record, "__MONOTONIC_TIMESTAMP")
@@ -101,7 +102,8 @@ def read_story(
             bound = max(bound, last.until_us)
         elif event == "dataflow-failed":
             life = str(record.get("_SYSTEMD_INVOCATION_ID", ""))
-            causes.setdefault(life, (_first_node(record), plain(record.get("DORA_REASON", ""))))
+            reason = plain(record.get("DORA_REASON", ""))
+            causes.setdefault(life, (_first_node(record), reason, _uuid(record)))
         elif one := _happened(record, event, mono_us):
             found.append(one)
     return [_with_cause(one, causes) for one in found], last
@@ -132,7 +134,7 @@ def _happened(record: Mapping[str, Any], event: str, mono_us: int) -> Happened |
         # Each failure of the unit has one such record, also if the runner could write nothing. Its
         # cause is what the runner has written in the same life.
         life = record.get("INVOCATION_ID") or record.get("USER_INVOCATION_ID") or ""
-        return Happened(FAILED, at_us, mono_us, cause=str(life))
+        return Happened(FAILED, at_us, mono_us, cause=str(life), uuid=_uuid(record))
     if event not in _WORDS:
         return None
     cause = plain(record.get("DORA_REASON", ""))
@@ -146,11 +148,17 @@ def _first_node(record: Mapping[str, Any]) -> str:
     return next(filter(is_node_id, nodes), "")
 
 
-def _with_cause(one: Happened, causes: Mapping[str, tuple[str, str]]) -> Happened:
+def _uuid(record: Mapping[str, Any]) -> str:
+    text = str(record.get("DORA_DATAFLOW", ""))
+    return text if is_uuid(text) else ""
+
+
+def _with_cause(one: Happened, causes: Mapping[str, tuple[str, str, str]]) -> Happened:
     if one.what != FAILED:
         return one
-    node, cause = causes.get(one.cause, ("", ""))
-    return one._replace(node=node, cause=cause)
+    node, cause, uuid = causes.get(one.cause, ("", "", ""))
+    # A user's manager does not record the dataflow.
+    return one._replace(node=node, cause=cause, uuid=one.uuid or uuid)
 
 
 def pause_left(last: Sent | None, now_us: int) -> int:

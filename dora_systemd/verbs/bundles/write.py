@@ -179,6 +179,10 @@ def _written_after(
     now_us: int,
 ) -> str:
     """Write the bundle; return its path. Raises DoraSystemdError."""
+    happened = failure.happened
+    if happened and happened.uuid not in ("", cell.uuid):
+        message = "another dataflow with that name has failed, whose black_box is not known"
+        raise DoraSystemdError(message, "doractl bundle writes one now")
     what = _evidence(reach, scope, cell.uuid, want_journal=True, failure=failure)
     manifest = replace(_manifest(what, BY), event=failure.event)
     store = BundleStore(scope.state_root, cell.name)

@@ -53,6 +53,8 @@ from dora_systemd.verbs.why import explain, subject_row
 
 BY = "doranotice"
 _POLL_SECONDS = 0.2
+_MOST_KNOWN = 4
+"""Dataflows whose settings are kept: those that were started within a pause."""
 _TEXT = "why.txt"
 _ENVIRONMENT = "environment"
 _RESULTS = {
@@ -93,11 +95,15 @@ def read_noticed(manager: Manager, name: str) -> Noticed | None:
 
 
 class Memory:
-    """What was read last of a dataflow, and the ring of its recorder, which is open."""
+    """What was read last of a dataflow, and the ring of its recorder, which is open.
+
+    The next start of the same file is another dataflow with that name, which may have failed when
+    the first one is reported.
+    """
 
     def __init__(self, manager: Manager, scope: Scope, name: str) -> None:
         self._manager, self._scope, self._name = manager, scope, name
-        self.noticed: Noticed | None = None
+        self._known: tuple[Noticed, ...] = ()  # the last of each dataflow, newest first
         self._ring: RingFile | None = None
 
     def learn(self) -> None:
@@ -107,8 +113,19 @@ class Memory:
         """
         with suppress(DoraSystemdError):
             if noticed := read_noticed(self._manager, self._name):
-                self.noticed = noticed
+                others = (one for one in self._known if one.cell.uuid != noticed.cell.uuid)
+                self._known = (noticed, *others)[:_MOST_KNOWN]
                 self._open_ring(noticed)
+
+    @property
+    def noticed(self) -> Noticed | None:
+        """What was read last."""
+        return next(iter(self._known), None)
+
+    def of(self, failure: Happened) -> Noticed | None:
+        """The dataflow that has failed, if that was read; the last one if it is not recorded."""
+        own = (one for one in self._known if failure.uuid in ("", one.cell.uuid))
+        return next(own, None)
 
     def _open_ring(self, noticed: Noticed) -> None:
         if noticed.box is None or not noticed.cell.options.has("record"):
@@ -153,10 +170,12 @@ class Sender:
 
     def send(self, happened: Sequence[Happened], pause_us: int) -> None:
         """Run the command of the setting, and record the notice, whatever came of it."""
-        if (noticed := self._memory.noticed) is None:
+        main = main_one([one for one in happened if self._memory.of(one)] or happened)
+        if (noticed := self._memory.of(main) or self._memory.noticed) is None:
             return self._record("", happened, pause_us, self._unnoticed())
         if noticed.box:
-            self._write_bundle(noticed.cell, noticed.box, happened, pause_us)
+            details = {"until": str(happened[0].mono_us), "pause": str(pause_us)}
+            self._write_bundle(noticed.cell, noticed.box, main, details)
             self._memory.close_ring()
         if not noticed.cell.options.has("on_failure"):
             return None
@@ -175,14 +194,12 @@ class Sender:
         return f"systemd had unloaded {unit_name(self._name)} before its setting was read"
 
     def _write_bundle(
-        self, cell: Cell, box: BlackBox, happened: Sequence[Happened], pause_us: int
+        self, cell: Cell, box: BlackBox, main: Happened, details: dict[str, str]
     ) -> None:
-        """Write a bundle of the newest failure, or record why there is none."""
+        """Write a bundle of a failure, or record why there is none. details: of that record."""
         # Imported late: it has all that doctor checks, and most notices need none.
         from dora_systemd.verbs.bundles.write import Failure, write_after
 
-        details = {"until": str(happened[0].mono_us), "pause": str(pause_us)}
-        main = main_one(happened)
         about = main if main.what in (FAILED, GIVEN_UP) else None
         failure = Failure(main.what, details, self._memory.ring_of(cell.uuid), about)
         write_after(self._reach, self._scope, cell, box, failure)

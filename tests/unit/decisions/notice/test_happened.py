@@ -29,6 +29,7 @@ from dora_systemd.decisions.notice.happened import (
 from dora_systemd.values import SECOND
 
 NOW = 1000 * SECOND
+UUID, OTHER = "3fa85f64-5717-4562-b3fc-2c963f66afa6", "550e8400-e29b-41d4-a716-446655440001"
 
 
 def record(seconds: float, **fields: str) -> dict[str, Any]:
@@ -111,6 +112,18 @@ def test_a_failure_that_the_runner_could_not_record() -> None:
     assert (one.what, one.node, one.cause) == ("failed", "", "")
 
 
+@pytest.mark.parametrize(
+    ("of_systemd", "of_runner", "uuid"),
+    [(UUID, "", UUID), ("", UUID, UUID), (UUID, OTHER, UUID), ("", "", ""), ("x", "", "")],
+)
+def test_which_dataflow_of_that_name_has_failed(of_systemd: str, of_runner: str, uuid: str) -> None:
+    """A user's manager does not record that."""
+    end = {**unit_failed(999, "1"), **({"DORA_DATAFLOW": of_systemd} if of_systemd else {})}
+    own = {**failed(998, "1", "exit code 1"), "DORA_DATAFLOW": of_runner}
+    ((one,), _) = read_story([end, own], "b", NOW)
+    assert one.uuid == uuid
+
+
 def test_only_what_came_after_the_last_notice() -> None:
     """Also what came while that notice was sent."""
     records = [
@@ -166,7 +179,7 @@ def test_other_failures() -> None:
         record(997, DORA_EVENT="release-rolled-back", DORA_NODES="sink", DORA_REASON="slow"),
         record(996, DORA_EVENT="node-ready", DORA_NODE="camera"),
     ]
-    assert [one[0:1] + one[3:] for one in read_story(records, "b", NOW)[0]] == [
+    assert [one[0:1] + one[3:5] for one in read_story(records, "b", NOW)[0]] == [
         ("node-given-up", "camera", "exit code 1"),
         ("machine-lost", "", "machine gpu: no answer"),
         ("rolled-back", "sink", "slow"),

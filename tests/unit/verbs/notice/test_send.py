@@ -22,6 +22,7 @@ from tests.unit.fakes.notes import Notes
 from tests.unit.fakes.recorder.ring import PAGE, message
 from tests.unit.verbs.notice.failures import SECRET, fail
 
+OTHER = "550e8400-e29b-41d4-a716-446655440001"
 UNIT, COMMAND = "dora-robot.service", "doranotice-robot.service"
 HAPPENED = [Happened(FAILED, 9, 9, "camera", "node camera: exit code 3")]
 Robot = Callable[..., Sender]
@@ -74,11 +75,43 @@ def test_another_dataflow_of_that_name_without_the_setting(
     """The failure was before that."""
     sender = robot("on_failure=/bin/tell x")
     sender.learn()
-    manager.add(options(uuid="550e8400-e29b-41d4-a716-446655440001"))
+    manager.add(options(uuid=OTHER))
     sender.learn()
     sender.send(HAPPENED, 15)
     ((event, _, uuid),) = events(notes)
     assert (event, uuid) == ("notice-sent", options().uuid)
+
+
+def test_no_bundle_is_about_a_dataflow_that_did_not_ask_for_one(
+    robot: Robot, manager: FakeManager, notes: Notes
+) -> None:
+    """It has the name of one that did, within the pause after a failure of that one.
+
+    The bundle was about the stop of that one, which is another cause than that of its failure.
+    """
+    sender = robot("black_box=yes")
+    sender.learn()
+    manager.add(options(uuid=OTHER))
+    sender.learn()
+    sender.send([Happened(FAILED, 90, 80, uuid=OTHER)], 15)
+    ((event, reason, until),) = notes.found("DORA_EVENT", "DORA_REASON", "DORA_UNTIL")
+    assert (event, until) == ("bundle-refused", "80")
+    assert reason.startswith("another dataflow with that name has failed")
+
+
+def test_a_dataflow_that_is_started_again_before_its_notice(
+    robot: Robot, manager: FakeManager, notes: Notes, tmp_path: Path
+) -> None:
+    """The bundle is about the failure of the first one, and not about the second one."""
+    sender = robot("black_box=yes")
+    sender.learn()
+    manager.add(with_texts(options(uuid=OTHER), "black_box=keep=1,size=4M"))
+    sender.learn()
+    sender.send([HAPPENED[0]._replace(uuid=options().uuid)], 15)
+    assert events(notes) == [("bundle-written", "", options().uuid)]
+    (row,) = read_bundles(ScopeIn(False, os.getuid(), tmp_path / "run"), ["robot"])
+    with opened(Path(row.file)) as bundle:
+        assert bundle.manifest.uuid == options().uuid
 
 
 @pytest.mark.parametrize(
