@@ -35,7 +35,6 @@ from dora_systemd.decisions.dora.protocol import (
     parse_heartbeat,
     parse_heartbeats,
     parse_results,
-    parse_running,
     parse_spawn_failure,
 )
 from dora_systemd.decisions.gateway.frames import Malformed, format_malformed, parse_request
@@ -130,7 +129,7 @@ def _reply(data: bytes) -> object:
     reply = parse_frame(text_of(data))
     if isinstance(reply, Reply):
         daemons = (parse_heartbeat(reply), parse_heartbeats(reply))
-        return daemons, parse_results(reply), parse_spawn_failure(reply), parse_running(reply, "")
+        return daemons, parse_results(reply), parse_spawn_failure(reply)
     return parse_life_event(reply, 1) if isinstance(reply, LogRecord) else None
 
 

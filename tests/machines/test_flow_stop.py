@@ -132,10 +132,7 @@ def test_the_order_holds_across_machines(flow: Stops, request: pytest.FixtureReq
         flow.wait_records(3)
         with flow.held():
             stop = run_beside(lambda: flow.cell.doractl("stop", NAME))
-            if (
-                flow.of("recorder") == "b"
-            ):  # tests/system/test_stop_order.py has one on this machine
-                wait_for("list has its status", lambda: _is_shown(row))
+            wait_for("list has its status", lambda: _is_shown(row))
         assert stop().returncode == 0
         flow.check_whole(3)
         assert not flow.left()

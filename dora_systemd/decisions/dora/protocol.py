@@ -237,18 +237,6 @@ def _silence_of(daemon: Mapping[str, Any]) -> int:
     return int(age * 1000) if isinstance(age, int | float) and isfinite(age) else 0
 
 
-LIST: Params = "List"
-
-
-def parse_running(reply: Reply, name: str) -> str:
-    """dora's id of the run with that name in the reply to LIST, or ""."""
-    for one in as_list(as_mapping(reply.result).get("DataflowList")):
-        ident = as_mapping(as_mapping(one).get("id"))
-        if ident.get("name") == name and as_mapping(one).get("status") == "Running":
-            return str(ident.get("uuid") or "")
-    return ""
-
-
 def parse_results(reply: Reply) -> dict[str, Exit] | None:
     """The reply to Check or Stop: None during the run, else how each node ended.
 

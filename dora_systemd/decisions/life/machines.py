@@ -66,7 +66,7 @@ def gathered(cell: Cell, event: life.Gathered) -> Next:
 
 
 def found(cell: Cell, event: life.RunStarted) -> Next:
-    """Subscribe to the events of the head's run, which this member has found."""
+    """Subscribe to the events of the head's run, which this member joins."""
     cell = replace(cell, run=event.run, awaited="")
     return to(cell, State.STARTING, Do.SUBSCRIBE, after=ENGINE_TIMEOUT)
 

@@ -142,6 +142,13 @@ class Ended:
 
 
 @dataclass(frozen=True)
+class Run:
+    """Head to member: the head has started a run, and receives its events."""
+
+    run: str  # dora's id of it
+
+
+@dataclass(frozen=True)
 class StopPart:
     """Head to member: end your nodes within `grace` µs, without a request to dora."""
 
@@ -205,6 +212,7 @@ Message = (
     | Hung
     | Refused
     | Ended
+    | Run
     | StopPart
     | Stopping
     | StopNode
@@ -227,6 +235,7 @@ _TYPES: Mapping[str, type[Any]] = {
     "hung": Hung,
     "refused": Refused,
     "ended": Ended,
+    "run": Run,
     "stop": StopPart,
     "stopping": Stopping,
     "stop-node": StopNode,
@@ -293,6 +302,8 @@ def _checked(message: Any) -> Message:
     if isinstance(message, Part):
         parse_name(message.name), parse_uuid(message.uuid), parse_machine(message.machine)
         _check_ports(message.coordinator, message.zenoh)
+    if isinstance(message, Run):
+        parse_uuid(message.run)
     if isinstance(message, Forwards):
         _check_ports(message.coordinator, *message.zenoh.values())
     return message  # type: ignore[no-any-return]

@@ -9,6 +9,7 @@ import hashlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from signal import SIGABRT
 from typing import TYPE_CHECKING, Any
@@ -163,8 +164,17 @@ class Head(Shared):
         assert isinstance(dora, SharedEngine)
         pipes.left_out = NOISE
         self.roster.push, self.roster.refresh = pump.push, pump.refresh
-        pump.amend = self.roster.amend
+        pump.amend, pump.on_event = self.roster.amend, partial(self._tell_run, pump)
         return HeadDialogue(options, pump, dora, nodes, pipes, self.roster)
+
+    def _tell_run(self, pump: Pump, event: life.Event) -> None:
+        """Have the members join the run when the head receives its events.
+
+        dora gives what it has reported before to the first who subscribes, and to nobody else: a
+        member would take the pids of the nodes here.
+        """
+        if isinstance(event, life.Subscribed):
+            self.roster.tell(wire.Run(pump.cell.run))
 
     def node_stops(
         self, pump: Pump, dora: Engine, nodes: Nodes, dialogue: Dialogue

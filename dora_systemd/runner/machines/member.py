@@ -125,6 +125,7 @@ class Member(Shared):
         self._prepared: Prepared | None = None
         self._environment: Mapping[str, str] = {}
         self._spawn: Callable[[str, Coroutine[Any, Any, None]], None] | None = None
+        self._join: Callable[[str], None] = lambda _: None
         self._has_head = asyncio.Event()
         self.stops_by_head = self.has_order = False
         self.grace = INFINITY
@@ -157,13 +158,13 @@ class Member(Shared):
     def dialogue(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> Dialogue:
-        """Return the Dialogue that finds the run of the head, and handles this machine's nodes."""
+        """Return the Dialogue that joins the run of the head, and handles this machine's nodes."""
         assert isinstance(dora, MemberEngine)
         pipes.left_out = NOISE
         self._pump, pump.amend = pump, partial(self._note_table, Uses(nodes))
         pump.on_event = self._tell_hung
         dialogue = MemberDialogue(options, pump, dora, nodes, pipes, self)
-        self._spawn = dialogue.spawn
+        self._spawn, self._join = dialogue.spawn, dialogue.join
         dialogue.spawn("receive from the head", self._hear_head())
         dialogue.spawn("report what its nodes run", self._tell_programs())
         return dialogue
@@ -231,6 +232,8 @@ class Member(Shared):
         return "" if own == other else f"it has dora {self._version}, the head has {there}"
 
     def _hear(self, message: wire.Message) -> None:
+        if isinstance(message, wire.Run):
+            self._join(message.run)
         if isinstance(message, wire.Stopping | wire.StopNode):
             self._stop_in_order(message)
         if isinstance(message, wire.Asked) and message.what in (RESTART, STOP):

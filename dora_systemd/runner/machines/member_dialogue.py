@@ -1,16 +1,14 @@
-"""Carries out the actions of a member: finds the run of the head, and handles its own nodes."""
+"""Carries out the actions of a member: joins the run of the head, and handles its own nodes."""
 
 import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
-from itertools import chain, repeat
 from typing import Any, Protocol
 
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
@@ -23,8 +21,7 @@ from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.watchdog import monotonic_us
 from dora_systemd.values import SECOND
 
-_POLL_SECONDS, _SOON, _LATER_SECONDS = 0.05, 200, 0.5
-"""Intervals of the polls for the run of the head, which may start days later: then longer ones."""
+_POLL_SECONDS = 0.05
 _EXPLAIN_SECONDS = 0.5
 """Time for the session to end: its reason is better than that of a lost connection to dora."""
 _ASK_SECONDS = 2.0
@@ -72,7 +69,7 @@ class MemberDialogue(Dialogue):
         own = super().actions(descriptor, variables)
         return {
             **own,
-            Do.GATHER: lambda: self._ask(Do.GATHER, self._find_run()),
+            Do.GATHER: self._report_ready,
             Do.ASK_SPAWN: lambda: self.spawn("find processes", find_pids(self._pump, self._nodes)),
             Do.ASK_RESULT: self._tell_result,
             Do.ASK_STOP: lambda: self._ask(Do.END_NODES, self._stop()),
@@ -80,20 +77,17 @@ class MemberDialogue(Dialogue):
             Do.EXIT: lambda: self._exit(own[Do.EXIT]),
         }
 
-    async def _find_run(self) -> None:
-        """Report to the head that the daemon has joined, and wait for the run of the head."""
+    def _report_ready(self) -> None:
+        """Report to the head that the daemon has joined. The head may start its run days later."""
         _, paths = self._nodes.places
         self._nodes.expect()
         self._voice.send(wire.Ready(str(paths.work)))
-        polls = chain([_POLL_SECONDS] * _SOON, repeat(_LATER_SECONDS))
-        while not (run := await self._running()):
-            await asyncio.sleep(next(polls))
-        self._pipes.set_run(run)
-        self._pump.push(life.RunStarted(now_us(), run))
 
-    async def _running(self) -> str:
-        reply = await self._dora.ask_soon(protocol.LIST)
-        return protocol.parse_running(reply, self._options.name)
+    def join(self, run: str) -> None:
+        """Take part in the run that the head has started."""
+        if self._pump.cell.state is State.GATHERING:
+            self._pipes.set_run(run)
+            self._pump.push(life.RunStarted(now_us(), run))
 
     def _events_ended(self) -> None:
         self.spawn("see why dora is silent", self._lose_head("the dora coordinator is gone"))
@@ -208,7 +202,7 @@ def is_going_down(is_of_user: bool) -> bool:
 async def find_pids(pump: Pump, nodes: Nodes) -> None:
     """Find the pids of starting nodes, until each is known or its node is not starting any more.
 
-    dora reports the pids before a member has found the run of the head and receives events. The
+    dora reports the pids before a member has joined the run of the head and receives events. The
     launchers wait for the pipes, and have written their pids to files.
     """
     with contextlib.suppress(TimeoutError):

@@ -11,6 +11,7 @@ from dora_systemd.decisions.machines.wire import (
     Part,
     Ready,
     Refused,
+    Run,
     StopPart,
     Table,
     expect,
@@ -30,6 +31,7 @@ MESSAGES = (
     Table("{}"),
     Refused("its path a.py is not there", "copy it"),
     Ended("node a: exit code 1"),
+    Run(UUID),
     StopPart(1_000_000),
 )
 
@@ -57,6 +59,7 @@ def test_an_unknown_key_is_of_a_newer_version() -> None:
         b'{"type": "lost", "words": {"head": 1}}',
         b'{"type": "ready", "work": {}}',
         b'{"type": "table", "status": {}}',
+        b'{"type": "run", "run": "../out"}',
         b'{"type": "ended", "reason": "\\ud800"}',
         b'{"type": "refused", "reason": "a\\u0000b"}',
         b'{"type": "forwards", "coordinator": {"head": 61000}, "zenoh": {}}',

@@ -7,7 +7,7 @@ import socket
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -22,7 +22,7 @@ from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.restarts import Life
-from dora_systemd.runner.machines.head import HeadDialogue
+from dora_systemd.runner.machines.head import Head, HeadDialogue
 from dora_systemd.runner.machines.roster import Roster
 from dora_systemd.runner.machines.shared import SharedEngine
 from dora_systemd.values import SECOND
@@ -44,7 +44,7 @@ NODES = {
 MID = ("daemon", "mid")
 
 
-class FakeHead(FakeDora):
+class FakeHead(FakeDora, SharedEngine):
     """daemons: of which machines dora has one; "" is that of the head. age: µs of each."""
 
     daemons: list[str]
@@ -69,9 +69,9 @@ class Bench:
         self.pump = Heard(cell, Life("uuid"), CellPaths(root), self.nodes, self.pipes)
         self.pump.heard, self.pump.calls = [], []
         self.roster.push = self.pump.push
-        dora = cast(SharedEngine, self.dora)
         self.roster.is_awaited = is_awaited
-        self.dialogue = HeadDialogue(given, self.pump, dora, self.nodes, self.pipes, self.roster)
+        own = self.pump, self.dora, self.nodes, self.pipes
+        self.dialogue = HeadDialogue(given, *own, self.roster)
         self.actions = self.dialogue.actions({"nodes": []}, {})
 
     @property
@@ -134,6 +134,24 @@ def test_it_goes_on_when_all_have_joined(tmp_path: Path) -> None:
         await bench.link(READY)
         await settle()
         assert bench.heard(life.Gathered) == [life.Gathered(0)]
+
+    run(tmp_path, work)
+
+
+def test_members_join_its_run_when_it_receives_the_events(tmp_path: Path) -> None:
+    """dora gives the pids of the nodes here to the first who subscribes, and to nobody else."""
+
+    async def work(bench: Bench) -> None:
+        head = Head(OPTIONS, Life("uuid"), None)
+        head.roster = bench.roster
+        head.dialogue(OPTIONS, bench.pump, bench.dora, bench.nodes, bench.pipes)
+        other = await bench.link(READY)
+        bench.be(State.STARTING, run=UUID)
+        bench.pump.on_event(life.RunStarted(0, UUID))
+        (forwards,) = other.heard()
+        assert forwards["type"] == "forwards"
+        bench.pump.on_event(life.Subscribed(0))
+        assert other.heard()[1:] == [{"type": "run", "run": UUID}]
 
     run(tmp_path, work)
 

@@ -129,6 +129,26 @@ def test_a_part_begins_its_life(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
+def test_it_joins_the_run_of_the_head_and_asks_dora_for_none(tmp_path: Path) -> None:
+    """It would take the events that dora has for the head."""
+
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        other.say(wire.Run(UUID))
+        await settle()
+        bench.actions[Do.GATHER]()
+        assert other.heard() == [{"type": "ready", "work": str(bench.nodes.places[1].work)}]
+        bench.be(state=State.GATHERING)
+        await settle()
+        assert not [one for one in bench.heard() if isinstance(one, life.RunStarted)]
+        other.say(wire.Run(UUID))
+        await settle()
+        assert bench.heard()[1:] == [life.RunStarted(0, UUID)]
+        assert ("run is", UUID) in bench.pipes.calls
+
+    run(tmp_path, work)
+
+
 def test_nobody_has_said_what_to_run() -> None:
     with pytest.raises(DoraSystemdError, match="no head says what to run"):
         Member(OPTIONS, Life("uuid"), None)
