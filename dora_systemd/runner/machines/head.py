@@ -182,8 +182,7 @@ class Head(Shared):
         """Return what carries out a stop that has an order, on all machines."""
         from dora_systemd.runner.machines.order import SpreadStops
 
-        assert isinstance(dialogue, HeadDialogue)
-        return SpreadStops(pump, dora, nodes, dialogue, self.roster, dialogue.lose_silent)
+        return SpreadStops(pump, dora, nodes, dialogue, self.roster)
 
 
 class HeadDialogue(Dialogue):
@@ -361,7 +360,7 @@ class HeadDialogue(Dialogue):
         self.spawn("see whether a machine falls silent", self._watch_silence())
         await super()._ask_stop()
 
-    def lose_silent(self) -> bool:
+    def _lose_silent(self) -> bool:
         """Report the loss of a machine with nodes that falls silent during a stop."""
         nodes = self._pump.cell.nodes
         needed = {nodes[node].machine for node in with_process(nodes)}
@@ -370,7 +369,7 @@ class HeadDialogue(Dialogue):
         return bool(silent)
 
     async def _watch_silence(self) -> None:
-        while self._pump.cell.state is State.STOPPING and not self.lose_silent():
+        while self._pump.cell.state is State.STOPPING and not self._lose_silent():
             await asyncio.sleep(_LOOK_SECONDS)
 
     def _begin_end(self) -> float:

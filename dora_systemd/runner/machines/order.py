@@ -5,15 +5,15 @@ node to all machines, so the head needs no answer of a member. A member keeps it
 machine has a node any more: the daemon may still have messages for nodes that stop later.
 """
 
-from collections.abc import Callable
-
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.node_table import with_process
 from dora_systemd.decisions.life.states import NodeAction, State, StopNode
 from dora_systemd.decisions.life.stop_order import most_time
 from dora_systemd.decisions.machines import wire
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks
 from dora_systemd.runner.cell.node_stops import NodeStops
-from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.machines.roster import Roster
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
@@ -27,20 +27,15 @@ _LOOK_SECONDS = 0.2
 class SpreadStops(NodeStops):
     """The stop of the nodes of one run, on the head.
 
-    lose_silent: reports the loss of a machine that falls silent.
+    A machine that is silent may only be slow, and a recorder there would lose what it has. So that
+    machine is lost when the lease ends its connection, and no earlier.
     """
 
     def __init__(
-        self,
-        pump: Pump,
-        dora: Engine,
-        nodes: Nodes,
-        tasks: Tasks,
-        roster: Roster,
-        lose_silent: Callable[[], object],
+        self, pump: Pump, dora: Engine, nodes: Nodes, tasks: Tasks, roster: Roster
     ) -> None:
         super().__init__(pump, dora, nodes, tasks)
-        self._roster, self._lose_silent = roster, lose_silent
+        self._roster = roster
 
     def perform(self, action: NodeAction) -> None:
         """Carry out one action, or have the machine of the node carry it out."""
@@ -81,8 +76,10 @@ class SpreadStops(NodeStops):
         return began
 
     async def _watch(self) -> None:
-        """Lose machines that fall silent; let the others leave when no node is left anywhere."""
+        """Lose machines that are gone; let the others leave when no node is left anywhere."""
         pump = self._pump
         while not await pump.wait(lambda cell: cell.state is not State.STOPPING, _LOOK_SECONDS):
-            self._lose_silent()
+            needed = {pump.cell.nodes[one].machine for one in with_process(pump.cell.nodes)}
+            for name in needed.intersection(self._roster.gone()):
+                pump.push(life.MachineLost(now_us(), name, "it does not answer"))
         self._roster.tell(wire.Stopping(pump.cell.stop_by))

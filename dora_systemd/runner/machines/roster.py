@@ -155,6 +155,10 @@ class Roster:
         """Return the members that may be gone."""
         return [name for name, one in self._members.items() if not one.is_heard]
 
+    def gone(self) -> list[str]:
+        """Return the members without a connection: it has ended, if only by the lease."""
+        return [name for name, one in self._members.items() if one.lines is None]
+
     def tell(self, message: wire.Message, machine: str = "") -> None:
         """Send a message to all connected members, or to the one with that name."""
         for name, one in self._members.items():

@@ -9,6 +9,7 @@ from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.cell.stops import NodeStop
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State, StopNode
+from dora_systemd.decisions.machines import wire
 from dora_systemd.runner.machines.order import SpreadStops
 from dora_systemd.values import SECOND
 from tests.unit.fakes.ends import FakeEnds
@@ -36,7 +37,7 @@ class Stopping(Bench):
         changes = {"stops": STOPS, "stop_limit": LIMIT, "stop_by": "SIGTERM", "ready_us": 1}
         self.be(State.STOPPING, nodes=NODES, **changes)
         given = self.pump, self.dora, self.nodes, self.dialogue, self.roster
-        self.stops = SpreadStops(*given, self.dialogue.lose_silent)
+        self.stops = SpreadStops(*given)
 
     def stopped(self) -> list[str]:
         """The nodes that dora was requested to stop."""
@@ -103,12 +104,33 @@ def test_a_stop_that_is_over_meanwhile(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
-def test_a_machine_that_falls_silent_is_lost(tmp_path: Path) -> None:
+def test_a_machine_that_is_slow_is_not_lost_before_the_lease_ends(tmp_path: Path) -> None:
+    """The loss would be SIGTERM for its recorder, which then saves nothing."""
+
     async def work(bench: Stopping, other: FakeEnds) -> None:
         bench.stops.perform(StopNode("camera", 10 * SECOND))
+        await asyncio.sleep(6)
+        assert not bench.heard(life.MachineLost)
+        other.say(wire.Beat())
+        await asyncio.sleep(6)
+        assert not bench.heard(life.MachineLost)
+        await asyncio.sleep(2)
+        assert bench.heard(life.MachineLost)[0] == life.MachineLost(0, "gpu", "no word for 7s")
+
+    run(tmp_path, work)
+
+
+def test_a_machine_that_is_gone_while_it_waits_for_its_turn(tmp_path: Path) -> None:
+    """It has reported its end, so the end of its connection is no other event."""
+
+    async def work(bench: Stopping, other: FakeEnds) -> None:
+        bench.stops.perform(StopNode("camera", 10 * SECOND))
+        other.say(wire.Ended(by="root", waits=1))
+        await asyncio.sleep(1)
+        gone = life.MachineLost(0, "gpu", "it does not answer")
+        assert gone not in bench.heard(life.MachineLost)
         other.reader.feed_eof()
         await asyncio.sleep(1)
-        lost = bench.heard(life.MachineLost)
-        assert life.MachineLost(0, "gpu", "it does not answer") in lost
+        assert gone in bench.heard(life.MachineLost)
 
     run(tmp_path, work)
