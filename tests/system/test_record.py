@@ -200,9 +200,13 @@ def test_memory_is_bounded_though_a_consumer_is_stopped(cell: Cell, project: Pro
         ring = Ring()
         assert not ring or ring.used <= 8.2 * 1024 * 1024
         seen.update(cell.pids("node-dora-systemd-recorder"))
-        return bool(ring) and ring.reading().states[0].received > MESSAGES
+        if not ring:
+            return False
+        # On a busy machine the recorder, which has the lowest priority, receives few of them.
+        state = ring.reading().states[0]
+        return state.received > 10 and state.received + state.dropped > MESSAGES
 
-    wait_for("many messages were recorded", is_done, 60 + MESSAGES / 10)
+    wait_for("many messages were sent", is_done, 60 + MESSAGES / 10)
     assert len(seen) == 1, "nothing has killed the recorder, and no limit of its memory"
     assert 5 <= len(file_of(Ring()).messages) <= 8
 
