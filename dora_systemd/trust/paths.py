@@ -89,8 +89,7 @@ def reached(path: str | Path) -> Iterator[tuple[int, Place]]:
 
     Raises OSError, and DoraSystemdError (BAD_INPUT) for a link that another user could change.
     """
-    with contextlib.ExitStack() as held:
-        walk = _Walk(held)
+    with contextlib.closing(_Walk()) as walk:
         parts = _parts(str(path))
         while parts:
             parts = walk.enter(parts[0]) + parts[1:]
@@ -108,8 +107,7 @@ def firm_part(path: str | Path, uid: int = 0, groups: Collection[int] = ()) -> s
     would give the account access.
     """
     firm = "/"
-    with contextlib.ExitStack() as held, contextlib.suppress(OSError, DoraSystemdError):
-        walk = _Walk(held)
+    with contextlib.suppress(OSError, DoraSystemdError), contextlib.closing(_Walk()) as walk:
         for part in _parts(str(path)):
             ahead = [part]
             while ahead:
@@ -167,37 +165,40 @@ def user_name(uid: int, nameless: str = "uid ") -> str:
 
 
 class _Walk:
-    """A walk from the root directory. Closing `held` closes its descriptors."""
+    """A walk from the root directory, with one descriptor however long the path is."""
 
-    def __init__(self, held: contextlib.ExitStack) -> None:
-        self._held = held
+    def __init__(self) -> None:
         self._links = 0
         self._cautious = os.geteuid() == 0
+        self.fd = os.open("/", STEP)
         self._begin()
 
+    def close(self) -> None:
+        os.close(self.fd)
+
     def _begin(self) -> None:
-        self.fd = self._open("/", None)
         self._status = os.fstat(self.fd)
         self._owners = {self._status.st_uid}
         self._shared = ""
         self._where = ""
 
-    def _open(self, name: str, parent: int | None) -> int:
-        fd = os.open(name, STEP, dir_fd=parent)
-        self._held.callback(os.close, fd)
-        return fd
-
     def enter(self, name: str) -> list[str]:
         """Enter `name`. If that is a link, return the components to walk instead of it."""
-        fd = self._open(name, self.fd)
+        fd = os.open(name, STEP, dir_fd=self.fd)
         status = os.fstat(fd)
         if stat.S_ISLNK(status.st_mode):
+            os.close(fd)
             return self._follow(name, status)
+        self._go(fd)
         self._shared = self._shared or self._sharing()
         self._where = f"{self._where}/{name}"
-        self.fd, self._status = fd, status
+        self._status = status
         self._owners.add(status.st_uid)
         return []
+
+    def _go(self, fd: int) -> None:
+        os.close(self.fd)
+        self.fd = fd
 
     def is_firm(self, name: str) -> bool:
         """Whether only root can replace the entry `name`. Raises OSError.
@@ -235,6 +236,7 @@ class _Walk:
             raise refusal(link, reason, "give the path that it leads to")
         target = os.readlink(name, dir_fd=self.fd)
         if target.startswith("/"):
+            self._go(os.open("/", STEP))
             self._begin()
         return _parts(target)
 

@@ -68,6 +68,25 @@ def test_a_circle_of_links_ends(tmp_path: Path) -> None:
         read_file(tmp_path / "a")
 
 
+def open_files() -> int:
+    return len([*Path("/proc/self/fd").iterdir()])
+
+
+def test_a_long_path_needs_one_descriptor(tmp_path: Path) -> None:
+    """With a few of them left, list still reads the node tables; a user's path cannot take all."""
+    deep = tmp_path / "/".join("d" * 50)
+    deep.mkdir(parents=True)
+    (tmp_path / "link").symlink_to(deep)
+    before = open_files()
+    for path in (deep, tmp_path / "link"):
+        with reached(path):
+            assert open_files() == before + 1
+    firm_part(deep)
+    with pytest.raises(FileNotFoundError), reached(deep / "none"):
+        pass
+    assert open_files() == before
+
+
 def test_own_links_are_followed(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"text")
     (tmp_path / "b").symlink_to("a")
