@@ -78,9 +78,16 @@ def with_host(text: str, host: str) -> str:
     if not host or "doractl " not in text:
         return text
     verbs = "|".join(VERBS)
-    command = rf"(\bby \S+ \()?\bdoractl (?=(?:--(?:system|user) )?(?:{verbs})\b)"
-    # What a user has called there, as in "stopped by root (doractl stop)", stays.
-    return re.sub(command, lambda one: one[0] if one[1] else f"doractl -H {host} ", text)
+    command = rf"(\bby \S+ \()?\bdoractl ((?:--(?:system|user) )?(?:{verbs})\b)"
+
+    def there(found: re.Match[str]) -> str:
+        by, words = found.groups()
+        if by:  # what a user has called there, as in "stopped by root (doractl stop)", stays
+            return found[0]
+        # What env prints leads to 127.0.0.1 there, so -H refuses env.
+        return f"{found[0]} on {host}" if words.endswith("env") else f"doractl -H {host} {words}"
+
+    return re.sub(command, there, text)
 
 
 def _open_closed() -> None:

@@ -17,6 +17,8 @@ from dora_systemd.cli.edge import Edge, with_host, write_view
         ("doractl: no dataflow named 'x'", "doractl: no dataflow named 'x'"),
         ("doractl -H c why x", "doractl -H c why x"),
         ("stopped by root (doractl stop)", "stopped by root (doractl stop)"),
+        ("the gateway, see doractl env", "the gateway, see doractl env on a@b:7"),
+        ("or doractl --user env for it", "or doractl --user env on a@b:7 for it"),
     ],
 )
 def test_commands_are_for_the_host_they_are_about(text: str, there: str | None) -> None:
