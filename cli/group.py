@@ -1,5 +1,6 @@
 """The verbs of doractl as a click group that imports only the verb that runs."""
 
+from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
 from inspect import cleandoc
@@ -86,6 +87,7 @@ WORDS_OF_OTHERS = {
     "create": "start",
     "check": "start --dry-run",
     "validate": "start --dry-run",
+    "node list": "list NAME",
 }
 """Commands of docker, pm2, systemctl and dora, with the equivalent command of doractl."""
 
@@ -118,7 +120,8 @@ class VerbGroup(click.Group):
         args = [name, *without_all(ctx, words)]
         if name.startswith("-") or self.get_command(ctx, name):
             return super().resolve_command(ctx, args)
-        raise usage_error(f"unknown command {name!r}", _meant_verb(name))
+        hint = _meant_verb(name, [*SHOWN, *ALIASES]) or "doractl --help lists all commands"
+        raise usage_error(f"unknown command {name!r}", hint)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs and their summaries without importing them."""
@@ -128,6 +131,23 @@ class VerbGroup(click.Group):
             rows = [(name, one.summary) for name, one in SHOWN.items() if one.section == section]
             with formatter.section(TITLES[section]):
                 formatter.write_dl([(name.ljust(width), summary) for name, summary in rows])
+
+
+class SubverbGroup(click.Group):
+    """A verb with verbs of its own."""
+
+    @property
+    def valid(self) -> str:
+        return f"valid commands: {', '.join(self.commands)}"
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name, group = args[0], self.name or ""
+        if name.startswith("-") or name in self.commands:
+            return super().resolve_command(ctx, args)
+        hint = _meant_verb(name, self.commands, group) or self.valid
+        raise usage_error(f"unknown command {f'{group} {name}'!r}", hint)
 
 
 @click.group(
@@ -167,12 +187,14 @@ def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
     return result if isinstance(result, int) else ExitCode.OK
 
 
-def _meant_verb(name: str) -> str:
+def _meant_verb(name: str, verbs: Iterable[str], group: str = "") -> str:
+    """The hint for an unknown verb, or one of a group; "" if no command is similar."""
     from difflib import get_close_matches
 
-    known = WORDS_OF_OTHERS.get(name)
-    meant = known or next(iter(get_close_matches(name, [*SHOWN, *ALIASES], n=1)), "")
-    return f"did you mean doractl {meant}?" if meant else "doractl --help lists all commands"
+    near = [f"{group} {one}".strip() for one in get_close_matches(name, verbs, n=1)]
+    known = WORDS_OF_OTHERS.get(f"{group} {name}".strip())
+    meant = known or next(iter(near), "")
+    return f"did you mean doractl {meant}?" if meant else ""
 
 
 def _near(error: click.NoSuchOption) -> list[str]:
@@ -197,6 +219,8 @@ def _usage_error(error: click.ClickException, arguments: list[str]) -> DoraSyste
     hint = f"did you mean {' or '.join(sorted(possible))}?" if possible else f"see {command} --help"
     if isinstance(error, click.MissingParameter):
         hint = _known_names(error) or hint
+    if context and isinstance(context.command, SubverbGroup) and text == "Missing command":
+        hint = context.command.valid
     words = text.split(". Did you mean")[0]
     words = f"{words[:1].lower()}{words[1:]}".replace("no such command", "unknown command", 1)
     if isinstance(error, click.NoSuchOption):

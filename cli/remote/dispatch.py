@@ -37,16 +37,13 @@ def run_elsewhere(arguments: list[str]) -> int:
             command = super().get_command(ctx, cmd_name)
             return command and _with_callback(command, run)
 
-        def resolve_command(
-            self, ctx: click.Context, args: list[str]
-        ) -> tuple[str | None, click.Command | None, list[str]]:
-            try:
-                return super().resolve_command(ctx, args)
-            except DoraSystemdError as error:
-                hint = with_host(error.hint, ",".join(given))
-                raise DoraSystemdError(error.message, hint, error.code) from error
-
-    return run_verb(words, _like(doractl, Elsewhere))
+    try:
+        return run_verb(words, _like(doractl, Elsewhere))
+    except DoraSystemdError as error:
+        if error.code is not ExitCode.USAGE:
+            raise
+        hint = with_host(error.hint, ",".join(given))
+        raise DoraSystemdError(error.message, hint, error.code) from error
 
 
 def _like(group: click.Group, kind: type[click.Group]) -> click.Group:

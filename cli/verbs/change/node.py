@@ -3,6 +3,7 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.group import SubverbGroup
 from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, scope_options
 from dora_systemd.decisions.cell.status import RESTART, STOP
@@ -16,7 +17,7 @@ _DOORS = {RESTART: "doractl node restart", STOP: "doractl node stop"}
 """The command that the journal records as requester."""
 
 
-@click.group("node")
+@click.group("node", cls=SubverbGroup, no_args_is_help=False)
 @scope_options
 def command() -> None:
     """Restart or stop a single node of a running dataflow.

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import click
 
+from dora_systemd.cli.group import SubverbGroup
 from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import (
     acting_options,
@@ -32,7 +33,7 @@ from dora_systemd.verbs.machines.register import (
 _HEADER = ("NAME", "HOST", "KEY")
 
 
-@click.group("machine")
+@click.group("machine", cls=SubverbGroup, no_args_is_help=False)
 @scope_options
 def command() -> None:
     """Add, list, check or remove machines of dataflows that run on several.

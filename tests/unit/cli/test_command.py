@@ -131,6 +131,10 @@ def test_every_option_says_what_it_does(name: str) -> None:
         (["biuld"], "unknown command 'biuld'", "did you mean doractl build?"),
         (["qqq"], "unknown command 'qqq'", "doractl --help lists all commands"),
         (["membe"], "unknown command 'membe'", "doractl --help lists all commands"),
+        (["node"], "missing command", "valid commands: restart, stop"),
+        (["node", "lits"], "unknown command 'node lits'", "valid commands: restart, stop"),
+        (["node", "list"], "unknown command 'node list'", "did you mean doractl list NAME?"),
+        (["machine", "ls"], "unknown command 'machine ls'", "did you mean doractl machine list?"),
         (["list", "--oll"], "unknown option --oll", "did you mean --all?"),
         (
             ["start", "--memroy-limit"],

@@ -176,6 +176,8 @@ def test_a_command_of_another_tool_is_meant_there(capsys: Printed, programs: Pat
     del programs
     main.run(["-H", "h1", "rm", "x", "--host=h2"])
     assert "did you mean doractl -H h1,h2 stop?" in capsys.readouterr().err
+    main.run(["-H", "h1", "node", "list"])
+    assert "did you mean doractl -H h1 list NAME?" in capsys.readouterr().err
 
 
 def test_help_is_ours(capsys: Printed, programs: Path) -> None:
