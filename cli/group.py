@@ -70,6 +70,9 @@ SHOWN = {name: verb for name, verb in VERBS.items() if name not in HIDDEN}
 """The others: those in --help, completion and hints."""
 ALIASES = {"ps": "list", "status": "list", "reset-failed": "reset"}
 
+SELECTORS = ("selector", "selectors")
+"""The names of arguments that mean dataflows."""
+
 WORDS_OF_OTHERS = {
     "ls": "list",
     "stat": "status",
@@ -230,7 +233,7 @@ def _usage_error(error: click.ClickException, arguments: list[str]) -> DoraSyste
 
 def _known_names(error: click.MissingParameter) -> str:
     """The hint for a missing SELECTOR: the dataflows that there are."""
-    if not error.ctx or not error.param or error.param.name not in ("selector", "selectors"):
+    if not error.ctx or not error.param or error.param.name not in SELECTORS:
         return ""
     from dora_systemd.adapters.bus.systemd import Bus
     from dora_systemd.verbs.facts.cells import read_cells

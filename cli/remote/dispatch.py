@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from dora_systemd.cli.edge import with_host
-from dora_systemd.cli.group import VerbGroup, doractl, run_verb
+from dora_systemd.cli.group import SELECTORS, VerbGroup, doractl, run_verb
 from dora_systemd.cli.remote.plan import ROLLOUTS, Plan, check_hosts, plan_of, valued_flags
 from dora_systemd.cli.remote.run import is_terminal, pass_through, run_on_all, run_there
 from dora_systemd.decisions.remote.command_line import part_hosts
@@ -66,7 +66,17 @@ def _with_callback(command: click.Command, run: Any) -> click.Command:
         command.commands = {name: _with_callback(one, run) for name, one in members}
     else:
         command.callback = run
+        if any(one.name in SELECTORS for one in command.params):
+            command.params = list(map(_without_need, command.params))
     return command
+
+
+def _without_need(param: click.Parameter) -> click.Parameter:
+    """A copy of a parameter of a verb that reports there if it is missing, with the names there."""
+    param = copy(param)
+    if isinstance(param, click.Argument) and param.required:
+        param.metavar, param.required = param.human_readable_name, False
+    return param
 
 
 def valued_options(verb: str) -> Set[str]:

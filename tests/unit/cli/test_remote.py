@@ -157,7 +157,7 @@ def test_a_login_has_a_bound(hosts: str, capsys: Printed, monkeypatch: pytest.Mo
         ("start x.yml --attach -H h1,h2", "cannot start on several hosts"),
         ("list --oll -H h1", "unknown option --oll"),
         ("strat -H h1", "unknown command 'strat'"),
-        ("show -H h1", "missing argument 'selector'"),
+        ("machine add -H h1", "missing argument 'host'"),
         ("list -H h1,", "cannot use '' as a host"),
         ("list -H -oX", "cannot use '-oX' as a host"),
         ("list -H", "option -H requires a host"),
@@ -178,6 +178,15 @@ def test_a_command_of_another_tool_is_meant_there(capsys: Printed, programs: Pat
     assert "did you mean doractl -H h1,h2 stop?" in capsys.readouterr().err
     main.run(["-H", "h1", "node", "list"])
     assert "did you mean doractl -H h1 list NAME?" in capsys.readouterr().err
+
+
+def test_the_host_knows_which_names_can_be_missing(capsys: Printed, programs: Path) -> None:
+    for words in ("restart", "set", "node stop", "rollback"):
+        main.run([*words.split(), "-H", "h1"])
+        assert programs.read_text() == f"h1 {words}\n"
+        programs.unlink()
+    main.run(["set", "-H", "h1", "--help"])
+    assert "Usage: doractl set [OPTIONS] SELECTOR\n" in capsys.readouterr().out
 
 
 def test_help_is_ours(capsys: Printed, programs: Path) -> None:
