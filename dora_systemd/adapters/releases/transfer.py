@@ -115,11 +115,14 @@ class Stream:
             size -= len(data)
             yield data
 
-    def wait_for_end(self) -> None:
-        """Wait until the sending process has ended."""
+    def wait_for_end(self, other: int) -> bool:
+        """Wait until the sender has ended; False if `other`, a pipe, has something before that."""
         with contextlib.suppress(OSError):
-            while os.read(self._fd, _CHUNK):
-                pass
+            while other not in select.select([self._fd, other], [], [])[0]:
+                if not os.read(self._fd, _CHUNK):
+                    return True
+            return False
+        return True
 
     def _more(self) -> bytes:
         if not select.select([self._fd], [], [], self._seconds)[0]:

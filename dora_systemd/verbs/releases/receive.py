@@ -96,8 +96,7 @@ def receive(
             _require_space(draft, parcel, wants)
             answer(format_wants(wants))
             _fill(stream, parcel, wants, draft, known, tell)
-            threading.Thread(target=_end_with, args=(stream,), daemon=True).start()
-            with _named(draft, parcel):
+            with _ends_with(stream), _named(draft, parcel):
                 source, start = _source(scope, request, parcel, draft)
                 _require_user(scope, parcel, source)
                 sent = replace(request, start=start)
@@ -127,10 +126,24 @@ def _interrupt(*_arguments: object) -> None:
     raise KeyboardInterrupt
 
 
-def _end_with(stream: Stream) -> None:
-    """End this process as SIGTERM does when the other host hangs up."""
-    stream.wait_for_end()
-    os.kill(os.getpid(), signal.SIGTERM)
+@contextmanager
+def _ends_with(stream: Stream) -> Iterator[None]:
+    """In the context, end this process as SIGTERM does when the other host hangs up."""
+    is_over, end = os.pipe()
+
+    def watch() -> None:
+        if stream.wait_for_end(is_over):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        os.write(end, b".")
+        watcher.join()
+        os.close(end)
+        os.close(is_over)
 
 
 def _require_space(draft: Draft, parcel: Parcel, wants: list[int]) -> None:

@@ -126,7 +126,10 @@ def test_a_stream_that_ends(read: Callable[[Stream], bytes]) -> None:
 def test_a_stream() -> None:
     stream = stream_of(b"head\nbody")
     assert (stream.line(10), b"".join(stream.chunks(3))) == (b"head", b"bod")
-    stream.wait_for_end()
+    is_over, end = os.pipe()
+    assert stream.wait_for_end(is_over)
+    os.write(end, b".")
+    assert not Stream(os.open("/dev/zero", os.O_RDONLY)).wait_for_end(is_over)
 
 
 def test_nobody_sends_any_more() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -52,14 +53,24 @@ class Sender(Bench):
         start = StartRequest("", flags={"dora": self.dora})
         request = replace(request, start=start, soak=3600 * SECOND if self.is_gone else 0)
         tell, warn = self.steps.append, self.warnings.append
-        # The other end stays open: the end of the stream ends this process.
-        stream = Stream(reading)
-        return receive(self.manager, self.scope, request, stream, answer, tell, warn)
+        stream, before = Stream(reading), _watchers()
+        try:
+            return receive(self.manager, self.scope, request, stream, answer, tell, warn)
+        finally:
+            # Else the end of the stream would end this process.
+            assert _watchers() == before
+            os.close(reading)
+            if not self.is_gone:
+                os.close(writing)
 
     def _hang_up(self, fd: int) -> None:
         self.manager.on_start = lambda: None
         os.close(fd)
         time.sleep(60)  # until the signal comes
+
+
+def _watchers() -> list[threading.Thread]:
+    return [one for one in threading.enumerate() if one.daemon]
 
 
 FILES = {"dataflow.yml": FLOW, "a.py": "print()", "b.py": "print()"}
