@@ -247,12 +247,28 @@ def _is_passed(setting: Setting[Any], settings: Settings) -> bool:
 
 def idle_warnings(settings: Settings) -> Iterator[str]:
     """A warning for each setting that has no effect without another one."""
+    for setting, needed in _idle(settings):
+        yield f"{setting.flags[0]} has no effect without {needed.flags[0]}"
+
+
+def require_effect(settings: Settings) -> None:
+    """Raise DoraSystemdError (USAGE) for a flag that has no effect without another setting.
+
+    A settings file may have the same key: it may be for more than one dataflow.
+    """
+    for setting, needed in _idle(settings):
+        flag, others = setting.flags[0], needed.flags[0]
+        if flag in settings.source(setting).split(", "):
+            hint = f"add {others}, or write {setting.name} in a settings file"
+            raise usage_error(f"cannot use {flag} without {others}", hint)
+
+
+def _idle(settings: Settings) -> Iterator[tuple[Setting[Any], Setting[Any]]]:
+    """The settings that are given and have no effect without another one, and that one."""
     policies = {settings[RESTART_POLICY], *settings.by_node(RESTART_POLICY).values()}
     owes = settings.by_node(OWES).values()
     policies |= {"on-failure" for one in owes for owed in one if owed.then == RESTART}
     idle: list[tuple[Setting[Any], Setting[Any]]]
     idle = [(one, RESTART_POLICY) for one in POLICY_SETTINGS[1:] if policies == {"no"}]
     idle += [(one, HOT_RELOAD) for one in (WATCH, IGNORE) if not settings[HOT_RELOAD]]
-    for setting, needed in idle:
-        if settings.is_given(setting):
-            yield f"{setting.flags[0]} has no effect without {needed.flags[0]}"
+    return ((one, needed) for one, needed in idle if settings.is_given(one))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.properties.sandbox import Sandbox
-from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.decisions.settings.resolve import Settings, require_effect
 from dora_systemd.decisions.settings.table import USER
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
@@ -66,6 +66,8 @@ def make_plan(scope: Scope, request: StartRequest, read: Files | None = None) ->
     """
     files = read or read_files(request)
     settings = settings_of(scope, files, request)
+    if not request.uuid:  # flags of a recorded start were accepted
+        require_effect(settings)
     directory = working_directory(files, settings)
     user = choose_user(scope, settings[USER], files.place, directory)
     with sight_of(account_of(user)) as sight:

@@ -20,6 +20,7 @@ from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.settings.resolve import (
     Settings,
     idle_warnings,
+    require_effect,
     resolve_settings,
     with_settings,
 )
@@ -92,6 +93,26 @@ def test_warnings() -> None:
         "--ignore has no effect without --hot-reload",
     ]
     assert not list(idle_warnings(settings({**given, "hot_reload": True})))
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"watch": ["*.py"]}, "cannot use --watch without --hot-reload"),
+        ({"ignore": ["*.py"]}, "cannot use --ignore without --hot-reload"),
+        ({"max_restarts": "3"}, "cannot use --max-restarts without --restart-policy"),
+        ({"max_restarts": "3", "restart_policy": "always"}, ""),
+    ],
+)
+def test_a_flag_without_effect_is_refused(flags: dict[str, object], message: str) -> None:
+    """A settings file may have the key."""
+    require_effect(settings({}, flags))
+    if not message:
+        require_effect(settings(flags))
+        return
+    with pytest.raises(DoraSystemdError, match=message) as caught:
+        require_effect(settings(flags))
+    assert caught.value.code is ExitCode.USAGE
 
 
 @pytest.mark.parametrize(
