@@ -20,7 +20,6 @@ from typing import Any
 from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.runner_socket.client import Request, refused_reply, unknown_request
 from dora_systemd.adapters.runner_socket.listener import Answer
-from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.status import (
     HELD,
     LATCHED,
@@ -32,6 +31,7 @@ from dora_systemd.decisions.cell.status import (
 )
 from dora_systemd.decisions.cell.stops import within_of
 from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.dora.life_events import refused_restart
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.node_table import held, is_over_but_for_held
 from dora_systemd.decisions.life.states import Cell, State
@@ -207,7 +207,10 @@ class NodeRequests:
         try:
             await (hand.bring_back(target) if is_stopped(old) else hand.replace(target))
         except DoraSystemdError as error:
-            _give_up(run, target, error)
+            now = run.pump.cell.nodes[node]
+            if refused := refused_restart(node, old, now, error.message, now_us()):
+                run.pump.push(refused)
+            self._role.tell_refused(old.machine, node, error.message)
             raise
         return f"Node restarting: {node}"
 
@@ -227,22 +230,6 @@ class NodeRequests:
         """Record a request, on the machine of the node too, before the request is carried out."""
         run.pump.push(event)
         await self._role.tell_asked(target.status.machine, event)
-
-
-def _give_up(run: Run, target: Target, error: DoraSystemdError) -> None:
-    """Mark an ended node as failed, because dora refuses to start the node again.
-
-    Dora also refuses that for a node that failed by itself just before: then its exit is the cause,
-    which can also be received later.
-    """
-    node, status = target.node, run.pump.cell.nodes[target.node]
-    if target.has_process and status.state == "reloading":
-        run.pump.push(life.NodeKept(now_us(), node, target.status))
-    elif not status.pid:
-        is_cause = protocol.NO_NODE in error.message and status.exit.is_failure
-        refused = Exit(words=error.message.removeprefix("cannot do that in "))
-        how = status.exit if is_cause else refused
-        run.pump.push(life.NodeExited(now_us(), node, how, will_restart=False))
 
 
 def _has_ended(node: NodeStatus) -> bool:

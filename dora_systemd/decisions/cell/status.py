@@ -51,6 +51,7 @@ HELD = "held"
 """Policy of a node that waits for a reload after it has failed."""
 LATCHED = "latched"
 """Policy of a node without restarts that dora starts once more, only to give it up."""
+_WITH_PROCESS = ("starting", "ready", "running", "reloading")
 ALIVE_NODE_STATES = frozenset({"ready", "running", "dynamic"})
 
 MAX_NODES = 2000
@@ -91,6 +92,11 @@ class NodeStatus(NamedTuple):
     def is_alive(self) -> bool:
         """Whether it counts as alive in "2/3 nodes"."""
         return self.state in ALIVE_NODE_STATES
+
+    @property
+    def may_run(self) -> bool:
+        """Whether its program may run. The head of several machines knows no pid of others."""
+        return bool(self.pid) or self.state in _WITH_PROCESS
 
 
 PROTOCOL = 1

@@ -4,7 +4,8 @@ import re
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import Exit
-from dora_systemd.decisions.dora.protocol import LogRecord, exit_value
+from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.dora.protocol import NO_NODE, LogRecord, exit_value
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.resources.oom import Oom
 
@@ -63,6 +64,23 @@ def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
     """The event of a line printed by the daemon: dora reports hung nodes only there."""
     match = _UNRESPONSIVE.search(line)
     return life.NodeHung(at_us, match[1], match[2]) if match else None
+
+
+def refused_restart(
+    node: str, before: NodeStatus, now: NodeStatus, reason: str, at_us: int
+) -> life.Event | None:
+    """The event of a requested restart that dora refuses; None if the next process runs anyway.
+
+    before: the request. Dora also refuses the restart of a node that has failed by itself just
+    before: then its exit is the cause, which can also be received later.
+    """
+    if now.state == "reloading" and before.may_run:
+        return life.NodeKept(at_us, node, before)
+    if now.pid:
+        return None
+    is_cause = NO_NODE in reason and now.exit.is_failure
+    how = now.exit if is_cause else Exit(words=reason.removeprefix("cannot do that in "))
+    return life.NodeExited(at_us, node, how, will_restart=False)
 
 
 def with_facts(

@@ -178,11 +178,11 @@ RUNNER_ENDED = "its supervisor process has ended"
 
 @dataclass(frozen=True)
 class Asked:
-    """Head to member: a restart or stop of one of the member's nodes was requested."""
+    """Head to member: a restart or stop of one of the member's nodes was requested, or refused."""
 
     node: str
-    what: str
-    by: str  # who requested that
+    what: str  # RESTART or STOP, or "" if dora has refused the restart
+    by: str  # who requested that, or why dora has refused it
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,9 @@ class Alone:
     async def tell_asked(self, machine: str, event: NodeAsked) -> None:
         """Notify the node's machine of a requested restart or stop, before that is carried out."""
 
+    def tell_refused(self, machine: str, node: str, reason: str) -> None:
+        """Notify the node's machine that dora has refused the requested restart."""
+
     def cell(self, cell: Cell) -> Cell:
         """Return the cell at the beginning of a run."""
         return cell

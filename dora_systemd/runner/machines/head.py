@@ -157,6 +157,11 @@ class Head(Shared):
                     while not self.roster.has_heard(machine, event):
                         await asyncio.sleep(_AGAIN_SECONDS)
 
+    def tell_refused(self, machine: str, node: str, reason: str) -> None:
+        """Notify a member: else the member records the next crash as the end of a restart."""
+        if machine:
+            self.roster.tell(wire.Asked(node, "", reason), machine)
+
     def dialogue(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> Dialogue:

@@ -22,7 +22,8 @@ from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import Ends, taken_over
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.status import RESTART, STOP, CellStatus
+from dora_systemd.decisions.cell.status import RESTART, STOP, CellStatus, NodeStatus
+from dora_systemd.decisions.dora.life_events import refused_restart
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.machines import wire
@@ -126,6 +127,7 @@ class Member(Shared):
         self._environment: Mapping[str, str] = {}
         self._spawn: Callable[[str, Coroutine[Any, Any, None]], None] | None = None
         self._join: Callable[[str], None] = lambda _: None
+        self._before: dict[str, NodeStatus] = {}  # of requests, by node
         self._has_head = asyncio.Event()
         self.stops_by_head = self.has_order = False
         self.grace = INFINITY
@@ -236,13 +238,26 @@ class Member(Shared):
             self._join(message.run)
         if isinstance(message, wire.Stopping | wire.StopNode):
             self._stop_in_order(message)
-        if isinstance(message, wire.Asked) and message.what in (RESTART, STOP):
-            self._push(life.NodeAsked(now_us(), message.node, message.what, message.by))
+        if isinstance(message, wire.Asked):
+            self._note_asked(message)
         if isinstance(message, wire.Check) and self._spawn is not None:
             self._spawn("check its part", self._answer_check(message.digest))
         if isinstance(message, wire.StopPart):
             self.grace = message.grace
             self._end_by_head("the head has lost another machine")
+
+    def _note_asked(self, message: wire.Asked) -> None:
+        """Record a request for a node, or that dora has refused its restart."""
+        node, nodes = message.node, self._pump.cell.nodes if self._pump else {}
+        if node not in nodes:
+            return
+        if message.what in (RESTART, STOP):
+            self._before[node] = nodes[node]
+            self._push(life.NodeAsked(now_us(), node, message.what, message.by))
+        elif not message.what and (before := self._before.pop(node, None)):
+            reason = short_line(message.by, _LONGEST)
+            if refused := refused_restart(node, before, nodes[node], reason, now_us()):
+                self._push(refused)
 
     def _stop_in_order(self, message: wire.Stopping | wire.StopNode) -> None:
         """Stop all nodes, or the one whose turn it is."""

@@ -42,7 +42,6 @@ _ANSWER_SECONDS = 30.0
 _READY_SECONDS = 30
 _MOST_SECONDS = 600
 _STARTS = 4
-_WITH_PROCESS = ("starting", "ready", "running", "reloading")
 
 
 class NotReady(Exception):
@@ -72,11 +71,6 @@ class Target:
     def patience(self) -> int:
         """µs until dora sends SIGTERM: dora's message to stop does not reach a node that starts."""
         return 0 if self.status.state == "starting" else self.grace
-
-    @property
-    def has_process(self) -> bool:
-        """Whether its program may run. The head of several machines knows no pid of others."""
-        return bool(self.status.pid) or self.status.state in _WITH_PROCESS
 
     @property
     def is_removable(self) -> bool:
@@ -117,7 +111,7 @@ class Swapper:
 
     async def replace(self, target: Target) -> None:
         """End the process of a node, and start the next one. Raises DoraSystemdError."""
-        if target.has_process and target.is_removable:
+        if target.status.may_run and target.is_removable:
             await self._end("RemoveNode", target)
             await self.begin(protocol.add_params(self._run, target.definition))
         else:
@@ -128,7 +122,7 @@ class Swapper:
 
         Raises DoraSystemdError if dora has given the node up.
         """
-        if target.has_process and is_restartable(target.status):
+        if target.status.may_run and is_restartable(target.status):
             # Dora refuses this for a node that is just being started.
             with contextlib.suppress(DoraSystemdError):
                 await self._end("RestartNode", target)

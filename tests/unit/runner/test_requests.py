@@ -38,6 +38,17 @@ BY = "root (doractl node stop)"
 LINES = ("a, outputs: [o]", "b, inputs: {i: a/o}", "c, inputs: {t: dora/timer/millis/10}")
 
 
+class Role(Alone):
+    """Records what it passes on to the machine of a node."""
+
+    def __init__(self, options: RunnerOptions) -> None:
+        super().__init__(options, Life("uuid"))
+        self.refused: list[tuple[str, str, str]] = []
+
+    def tell_refused(self, machine: str, node: str, reason: str) -> None:
+        self.refused.append((machine, node, reason))
+
+
 class AskedBench(ReloadBench):
     """Node a, which b reads, and c, which nobody reads; they end with an error."""
 
@@ -55,7 +66,8 @@ class AskedBench(ReloadBench):
         self.flow.write_text(f"nodes:\n{lines}")
         reloader = Reloader(self.options, {}, SettingsFile("none.yml", root / "kept.yml"))
         reloader.begin(self.run, prepare(self.options, {}), 0)
-        self.requests = NodeRequests(reloader, Alone(self.options, Life("uuid")), extend)
+        self.role = Role(self.options)
+        self.requests = NodeRequests(reloader, self.role, extend)
 
     def end(self) -> None:
         self.pump.push(
@@ -172,6 +184,8 @@ def test_a_node_that_dora_does_not_replace_runs_on(tmp_path: Path) -> None:
 
     bench = run(tmp_path, scene, a=NEVER)
     assert bench.status("a") == NEVER
+    ((_, node, reason),) = bench.role.refused
+    assert (node, reason) == ("a", "cannot do that in dora: replacement adds input `i`")
 
 
 @pytest.mark.parametrize(("is_job", "times"), [(True, 4), (False, 0)])

@@ -372,6 +372,21 @@ def test_an_abort_waits_for_the_word_of_the_member(tmp_path: Path, next_words: s
     run(tmp_path, work)
 
 
+def test_a_member_learns_that_dora_has_refused_a_restart(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        del bench
+        head, other = Head(OPTIONS, Life("uuid"), None), FakeEnds()
+        talk = asyncio.create_task(head.roster.link({"machine": "gpu"}, other.ends))
+        await settle()
+        head.tell_refused("", "here", "it is too late")
+        head.tell_refused("gpu", "mid", "it is too late")
+        told = [one for one in other.heard() if one["type"] == "asked"]
+        assert told == [{"type": "asked", "node": "mid", "what": "", "by": "it is too late"}]
+        talk.cancel()
+
+    run(tmp_path, work)
+
+
 def test_a_member_with_another_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "sink.py").write_text("new")
     (tmp_path / "same.py").write_text("same")

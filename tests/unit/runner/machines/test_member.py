@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.runner_socket.listener import Ends
-from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import NodeRights, rights_of
@@ -208,6 +208,33 @@ def test_what_the_head_says(tmp_path: Path) -> None:
         bench.be(stop_by="SIGTERM")
         bench.actions[Do.EXIT]()
         assert other.heard() == [{"type": "ended", "reason": "", "by": "", "failed": 0, "waits": 0}]
+
+    run(tmp_path, work)
+
+
+def test_a_restart_that_dora_refuses_is_taken_back(tmp_path: Path) -> None:
+    """Then a crash of the node is one: nobody has requested that any more."""
+
+    async def work(bench: Bench) -> None:
+        other, before = await bench.head(), NodeStatus("running", 7)
+        refused = wire.Asked("mid", "", "cannot do that in dora: it is too late")
+        other.say(refused, wire.Asked("other", "restart", "root"), refused)
+        await settle()
+        assert bench.heard()[1:] == []
+        for pid in (7, 0):
+            bench.be(nodes={"mid": before})
+            other.say(wire.Asked("mid", "restart", "root"))
+            await settle()
+            state = "reloading" if pid else "starting"
+            bench.be(nodes={"mid": before._replace(state=state, pid=pid, asked="restart")})
+            other.say(refused, refused)
+            await settle()
+        asked = life.NodeAsked(0, "mid", "restart", "root")
+        words = Exit(words="dora: it is too late")
+        assert bench.heard()[1:] == [
+            *(asked, life.NodeKept(0, "mid", before)),
+            *(asked, life.NodeExited(0, "mid", words, will_restart=False)),
+        ]
 
     run(tmp_path, work)
 
