@@ -173,6 +173,20 @@ def test_a_node_there_gets_more_time(request: pytest.FixtureRequest) -> None:
         flow.check_whole(1, ("camera",))
 
 
+def test_a_machine_that_is_slow_for_some_seconds(request: pytest.FixtureRequest) -> None:
+    """Its recorder gets its stop, and not the SIGTERM of a machine that is lost."""
+    flow = Stops({"gpu": "b"}, ("recorder",), seconds=0)
+    with flow_on(flow, announced(request)):
+        flow.start()
+        flow.wait_records()
+        runner = flow.pid("b", "dora_systemd.runner")
+        hang = f"kill -STOP {runner}; sleep 4; kill -CONT {runner}"
+        hangs = run_beside(lambda: there("b", hang))
+        flow.cell.doractl("stop", NAME)
+        assert hangs().returncode == 0
+        flow.check_whole(1)
+
+
 @lost
 @pytest.mark.warns("dora-flow", "Node ")
 def test_a_machine_without_power_leaves_the_order_of_the_others(
