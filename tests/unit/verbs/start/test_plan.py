@@ -93,6 +93,16 @@ def test_every_plan_has_a_uuid_of_its_own(project: Path) -> None:
     assert plan_of(project).options.uuid != plan_of(project).options.uuid
 
 
+def test_a_flag_without_effect(project: Path) -> None:
+    """A recorded start may have it: that of another version has accepted it."""
+    with pytest.raises(DoraSystemdError, match="cannot use --watch without --hot-reload"):
+        plan_of(project, watch=("*.py",))
+    request = StartRequest(
+        str(project / "robot.yml"), None, {"watch": ("*.py",)}, {"PATH": f"{project}/bin"}
+    )
+    assert make_plan(USER, replace(request, uuid="u")).options.name == "robot"
+
+
 def test_interpreter(project: Path) -> None:
     """--venv, else VIRTUAL_ENV, else .venv beside the dataflow."""
     places = [project / name for name in ("flag", "variable", ".venv")]
