@@ -106,7 +106,7 @@ class Stops(Flow):
         assert len(episodes) == times
         for node in sources:
             for episode, (at, sent) in zip(episodes, self.ends(node), strict=True):
-                assert episode[node] == sent or is_overtaken(episode, node)
+                assert episode[node] == sent or is_overtaken(episode, node, sent)
                 assert at <= episode["told"], node
 
 

@@ -105,7 +105,7 @@ class Story:
             sent = recorders.ends(self.cell, node)[-1][1]
             if episodes[-1][node] == sent:
                 continue
-            if not recorders.is_overtaken(episodes[-1], node):
+            if not recorders.is_overtaken(episodes[-1], node, sent):
                 return f"{node} sent {sent}, and {episodes[-1][node]} were saved"
             self.table.overtaken[kind] = self.table.overtaken.get(kind, 0) + 1
         return ""
