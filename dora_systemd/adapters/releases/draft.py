@@ -4,17 +4,29 @@ Everything is created below a directory that only its writer can change, so no p
 elsewhere. Files that are equal to those of the last release become hard links to them.
 """
 
+import contextlib
 import ctypes
 import errno
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dora_systemd.adapters.releases.store import MANIFEST, Store, remove_tree, stored_at, write_part
+from dora_systemd.adapters.releases.store import (
+    MANIFEST,
+    Store,
+    read_by_threads,
+    remove_tree,
+    stored_at,
+    write_part,
+)
 from dora_systemd.decisions.releases.manifest import Manifest, Stored, format_manifest
 from dora_systemd.names import TREE
 from dora_systemd.trust.paths import sync_directory
+
+if TYPE_CHECKING:
+    from dora_systemd.adapters.releases.store import Read
 
 _CHUNK = 256 * 1024
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -35,6 +47,7 @@ class Draft:
         self._path = store.path / f".{kind}-{os.urandom(6).hex()}"
         self._tree = self._path / TREE
         self._made = {self._tree}
+        self._ahead: dict[str, Read] = {}
         self.damaged: list[str] = []
         self._path.mkdir(0o700)  # others may not read what it gets
         try:
@@ -67,12 +80,19 @@ class Draft:
         from release to release, and no later deploy would repair it.
         """
         file = self._store.tree(release_id) / path
-        is_intact = stored_at(file) == stored
+        ahead = self._ahead.get(path)
+        is_intact = (ahead.result() if ahead else stored_at(file)) == stored
         if is_intact:
             self.adopt(path, file)
         else:
             self.damaged.append(path)
         return is_intact
+
+    @contextlib.contextmanager
+    def reading_ahead(self, release_id: str, paths: Iterable[str]) -> Iterator[None]:
+        """In the context, threads read the files that share() will compare."""
+        with read_by_threads(self._store.tree(release_id), paths) as self._ahead:
+            yield
 
     def adopt(self, path: str, file: Path) -> None:
         """Share a file of another tree, which must be read-only, by a hard link."""

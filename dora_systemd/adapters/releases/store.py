@@ -10,8 +10,9 @@ import fcntl
 import hashlib
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dora_systemd.decisions.releases.manifest import (
     Manifest,
@@ -34,6 +35,11 @@ from dora_systemd.trust.files import MAX_BYTES, append_lines, read_file, read_li
 from dora_systemd.trust.paths import sync_directory
 from dora_systemd.trust.programs import spawn
 from dora_systemd.values import shown
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+    Read = Future[Stored | None]
 
 MANIFEST = "release.json"
 UNIT = "unit"
@@ -87,8 +93,10 @@ class Store:
 
     def intact(self, manifest: Manifest) -> dict[str, Stored]:
         """Return the files of a release that are unchanged since its manifest was written."""
-        tree = self.tree(manifest.id)
-        return {path: one for path, one in manifest.files.items() if one == stored_at(tree / path)}
+        with read_by_threads(self.tree(manifest.id), manifest.files) as found:
+            return {
+                path: one for path, one in manifest.files.items() if one == found[path].result()
+            }
 
     def write_manifest(self, manifest: Manifest) -> None:
         """Replace the manifest of a release. Raises OSError."""
@@ -275,6 +283,19 @@ def stored_at(path: Path) -> Stored | None:
     except OSError:
         return None
     return Stored(status.st_size, bool(status.st_mode & 0o111), digest)
+
+
+@contextlib.contextmanager
+def read_by_threads(tree: Path, paths: Iterable[str]) -> Iterator[dict[str, "Read"]]:
+    """Have all processors read files of a release, whose checksums take most of a deploy."""
+    # Imported late: it imports logging, and most verbs only list releases.
+    from concurrent.futures import ThreadPoolExecutor
+
+    pool = ThreadPoolExecutor(len(os.sched_getaffinity(0)))
+    try:
+        yield {path: pool.submit(stored_at, tree / path) for path in paths}
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def unusable(path: Path, error: OSError) -> DoraSystemdError:

@@ -150,4 +150,7 @@ def _commands(
 def _fill(
     project: Project, found: dict[str, Found], draft: Draft, last: Manifest | None, tell: Tell
 ) -> dict[str, Stored]:
-    return copy_files(project, found, draft, last, lambda *amount: tell(copying(*amount)))
+    old = last.files if last else {}
+    same = [path for path, one in found.items() if path in old and old[path].seen == one.seen]
+    with draft.reading_ahead(last.id if last else "", same):
+        return copy_files(project, found, draft, last, lambda *amount: tell(copying(*amount)))

@@ -65,7 +65,8 @@ def test_a_release(store: Store) -> None:
 def test_what_is_shared_survives_the_first_owner(store: Store) -> None:
     written(store, ONE)
     draft = Draft(store)
-    assert draft.share("d/a.py", ONE, store.manifest(ONE).files["d/a.py"])
+    with draft.reading_ahead(ONE, ["d/a.py"]):
+        assert draft.share("d/a.py", ONE, store.manifest(ONE).files["d/a.py"])
     draft.publish(manifest(TWO, {}), None)
     shared = store.tree(TWO) / "d/a.py"
     assert shared.stat().st_nlink == 2
@@ -75,8 +76,11 @@ def test_what_is_shared_survives_the_first_owner(store: Store) -> None:
     store.remove(ONE)  # as by two at once
 
 
+@pytest.mark.parametrize("ahead", [[], ["d/a.py"]], ids=["now", "ahead"])
 @pytest.mark.parametrize("data", ["abd", "", None])
-def test_what_has_changed_on_the_disk_is_not_shared(store: Store, data: str | None) -> None:
+def test_what_has_changed_on_the_disk_is_not_shared(
+    store: Store, data: str | None, ahead: list[str]
+) -> None:
     """Same name, size and time, and another content; or a file that is gone."""
     one = written(store, ONE)
     path = store.tree(ONE) / "d/a.py"
@@ -89,7 +93,8 @@ def test_what_has_changed_on_the_disk_is_not_shared(store: Store, data: str | No
         path.chmod(0o555)
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     draft = Draft(store)
-    assert not draft.share("d/a.py", ONE, one.files["d/a.py"])
+    with draft.reading_ahead(ONE, ahead):
+        assert not draft.share("d/a.py", ONE, one.files["d/a.py"])
     assert draft.damaged == ["d/a.py"]
     assert not (draft.tree / "d/a.py").exists()
     draft.discard()

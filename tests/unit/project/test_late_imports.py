@@ -29,6 +29,7 @@ LATE = {
     },
     "it imports logging, and most commands run nothing in a thread": {
         "adapters.host.process": {"concurrent.futures"},
+        "adapters.releases.store": {"concurrent.futures"},
     },
     "it has all properties, and verbs that read processes judge no systemd": {
         "decisions.views.diagnosis": {"decisions.unit.systemd_versions"},
