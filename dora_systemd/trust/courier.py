@@ -42,13 +42,14 @@ _GIT = (
 _OPEN = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 
-def facts(path: str) -> list[Any] | None:
+def facts(path: str, opens: bool = False) -> list[Any] | None:
     """Path, kind, size, whether it is executable, target, signature and time of the last change.
 
-    None for nothing.
+    None for nothing. opens: open the file, as then a network file system requests its times of the
+    server. Raises OSError.
     """
     try:
-        found = Path(path).lstat()
+        found = opened_status(path) if opens else Path(path).lstat()
     except (FileNotFoundError, NotADirectoryError):
         return None
     kind = _KINDS.get(stat.S_IFMT(found.st_mode), "special file")
@@ -56,6 +57,15 @@ def facts(path: str) -> list[Any] | None:
     is_executable = bool(found.st_mode & stat.S_IXUSR)
     own = (path, kind, found.st_size, is_executable, target)
     return [*own, signature(found), found.st_ctime_ns]
+
+
+def opened_status(path: str) -> os.stat_result:
+    """Open a file, and return its status. Raises OSError."""
+    fd = os.open(path, _OPEN)
+    try:
+        return os.fstat(fd)
+    finally:
+        os.close(fd)
 
 
 def signature(found: os.stat_result) -> str:
@@ -122,15 +132,13 @@ class Rules:
         )
 
 
-def content(path: str, known: str = "") -> Iterator[bytes]:
-    """The content of a regular file; nothing if it is `known`, see Found.seen."""
-    fd = os.open(path, _OPEN)  # a network file system requests the times of its server only now
+def content(path: str) -> Iterator[bytes]:
+    """The content of a regular file."""
+    fd = os.open(path, _OPEN)
     with os.fdopen(fd, "rb", buffering=0) as file:
-        found = os.fstat(fd)
-        if not stat.S_ISREG(found.st_mode):
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
             raise OSError(0, "not a regular file")
-        seen = f"{signature(found)} {found.st_ctime_ns}"
-        while seen != known and (chunk := file.read(CHUNK)):
+        while chunk := file.read(CHUNK):
             yield chunk
 
 
@@ -209,7 +217,7 @@ def answer(request: dict[str, Any]) -> Iterator[bytes]:
     """The data of an answer. Raises OSError."""
     what = request["ask"]
     if what == "read":
-        yield from content(request["path"], request["known"])
+        yield from content(request["path"])
     elif what == "list":
         yield json.dumps(listed(request["path"], request["most"])).encode()
     elif what == "walk":
@@ -217,7 +225,7 @@ def answer(request: dict[str, Any]) -> Iterator[bytes]:
         rules.enter(request["path"])
         yield json.dumps(listed(request["path"], request["most"], rules)).encode()
     elif what == "facts":
-        yield json.dumps([facts(one) for one in request["paths"]]).encode()
+        yield json.dumps([facts(one, request["opens"]) for one in request["paths"]]).encode()
     elif what == "git":
         yield json.dumps(tracked(request["owners"], request["most"])).encode()
 

@@ -99,12 +99,12 @@ class Project:
             raise self._broken(directory)
         return rows
 
-    def facts(self, paths: Sequence[str]) -> list[list[Any] | None]:
-        """The facts of these files, None for one that is not there."""
+    def facts(self, paths: Sequence[str], opens: bool = False) -> list[list[Any] | None]:
+        """The facts of these files, None for one that is not there. opens: see courier.facts()."""
         found: list[list[Any] | None] = []
         for start in range(0, len(paths), _BATCH):
             part = paths[start : start + _BATCH]
-            rows = self._value({"ask": "facts", "paths": list(part)}, part[0])
+            rows = self._value({"ask": "facts", "paths": list(part), "opens": opens}, part[0])
             if not isinstance(rows, list) or len(rows) != len(part):
                 raise self._broken(part[0])
             asked = [(one, row) for one, row in zip(part, rows, strict=True) if row is not None]
@@ -114,12 +114,9 @@ class Project:
             found += rows
         return found
 
-    def read(self, path: str, known: str = "") -> Iterator[bytes]:
-        """The content of a file; nothing if it is `known`, see Found.seen.
-
-        Raises DoraSystemdError; the caller bounds its length.
-        """
-        yield from self._ask({"ask": "read", "path": path, "known": known}, path)
+    def read(self, path: str) -> Iterator[bytes]:
+        """The content of a file. Raises DoraSystemdError; the caller bounds its length."""
+        yield from self._ask({"ask": "read", "path": path}, path)
 
     def tracked(self, owners: Sequence[int], most: int) -> tuple[list[str] | None, str]:
         """The files that git would track, None without git, and the revision, "" without one.
