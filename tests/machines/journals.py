@@ -28,10 +28,12 @@ BUSY = (
     *("node exited with error: Signal(15)", "State 'stop-post' timed out"),
     *("failed to send log message to dora-coordinator", "WS send channel closed"),
     "Received Data for unknown expr_id",
+    *("failed to send heartbeat message to daemon", "daemons that failed watchdog"),
 )
 """Of a machine that gives a node too little time within the grace, or systemd's last command, or
 whose daemon still has something to report when the coordinator of the head has ended, or receives a
-message of a node that was killed before it knows the name of the output."""
+message of a node that was killed before it knows the name of the output; or whose coordinator ends
+later than the daemon of another machine."""
 
 
 def _journalctl(machine: str, *words: str) -> str:
