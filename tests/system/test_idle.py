@@ -28,14 +28,9 @@ _VOLUNTARY = re.compile(r"^voluntary_ctxt_switches:\s*(\d+)$", re.MULTILINE)
 
 
 def waits(pid: int) -> int:
-    """How often a thread of the process has begun to wait, see proc_pid_status(5).
-
-    Not for a page that the kernel had taken away, as it does from idle processes on some machines:
-    major faults, see proc_pid_stat(5).
-    """
+    """How often a thread of the process has begun to wait, see proc_pid_status(5)."""
     statuses = (path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/status"))
-    faults = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[9]
-    return sum(int(one) for text in statuses for one in _VOLUNTARY.findall(text)) - int(faults)
+    return sum(int(one) for text in statuses for one in _VOLUNTARY.findall(text))
 
 
 def times(cell: Cell) -> list[int]:
