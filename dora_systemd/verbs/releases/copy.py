@@ -19,7 +19,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import Project, opened_project
 from dora_systemd.verbs.releases.build import Build, built_project
-from dora_systemd.verbs.releases.files import copy_files, find_files
+from dora_systemd.verbs.releases.files import copy_files, find_files, seen_before
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source
 from dora_systemd.verbs.releases.trial import Standing
@@ -150,7 +150,6 @@ def _commands(
 def _fill(
     project: Project, found: dict[str, Found], draft: Draft, last: Manifest | None, tell: Tell
 ) -> dict[str, Stored]:
-    old = last.files if last else {}
-    same = [path for path, one in found.items() if path in old and old[path].seen == one.seen]
+    same = seen_before(found, last.files if last else {})
     with draft.reading_ahead(last.id if last else "", same):
         return copy_files(project, found, draft, last, lambda *amount: tell(copying(*amount)))

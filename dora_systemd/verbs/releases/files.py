@@ -159,6 +159,11 @@ def digests(
             yield path, Stored(one.size, one.is_executable, digest)
 
 
+def seen_before(found: Mapping[str, Found], known: Mapping[str, Stored]) -> list[str]:
+    """The paths of files that look as they did when a release recorded them."""
+    return [path for path, one in found.items() if path in known and known[path].seen == one.seen]
+
+
 def _unchanged(
     project: Project, found: Mapping[str, Found], known: Mapping[str, Stored]
 ) -> dict[str, str]:
@@ -166,7 +171,7 @@ def _unchanged(
 
     The owner of a project who lies about a change gets the former content.
     """
-    same = [path for path, one in found.items() if path in known and known[path].seen == one.seen]
+    same = seen_before(found, known)
     now = project.facts(same, opens=True) if same else []
     rows = ((known[path], row) for path, row in zip(same, now, strict=True) if row)
     return {row[0]: one.digest for one, row in rows if Found(*row).seen == one.seen}
