@@ -41,6 +41,11 @@ def with_process(nodes: NodeTable) -> list[str]:
     ]
 
 
+def busy_machines(nodes: NodeTable) -> set[str]:
+    """The machines on which dora has a process; "" for this one."""
+    return {nodes[ident].machine for ident in with_process(nodes)}
+
+
 def all_ready(nodes: NodeTable, at_us: int) -> NodeTable:
     """Return the table after dora has opened its start barrier."""
     return {

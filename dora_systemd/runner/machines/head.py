@@ -30,7 +30,7 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.node_table import with_process
+from dora_systemd.decisions.life.node_table import busy_machines
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import check_placed, format_differing, is_here, with_works
@@ -367,8 +367,7 @@ class HeadDialogue(Dialogue):
 
     def _lose_silent(self) -> bool:
         """Report the loss of a machine with nodes that falls silent during a stop."""
-        nodes = self._pump.cell.nodes
-        needed = {nodes[node].machine for node in with_process(nodes)}
+        needed = busy_machines(self._pump.cell.nodes)
         if silent := next((name for name in self._roster.silent() if name in needed), ""):
             self._lose(silent, "it does not answer")
         return bool(silent)

@@ -6,7 +6,7 @@ machine has a node any more: the daemon may still have messages for nodes that s
 """
 
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.node_table import with_process
+from dora_systemd.decisions.life.node_table import busy_machines
 from dora_systemd.decisions.life.states import NodeAction, State, StopNode
 from dora_systemd.decisions.life.stop_order import most_time
 from dora_systemd.decisions.machines import wire
@@ -79,7 +79,6 @@ class SpreadStops(NodeStops):
         """Lose machines that are gone; let the others leave when no node is left anywhere."""
         pump = self._pump
         while not await pump.wait(lambda cell: cell.state is not State.STOPPING, _LOOK_SECONDS):
-            needed = {pump.cell.nodes[one].machine for one in with_process(pump.cell.nodes)}
-            for name in needed.intersection(self._roster.gone()):
+            for name in busy_machines(pump.cell.nodes).intersection(self._roster.gone()):
                 pump.push(life.MachineLost(now_us(), name, "it does not answer"))
         self._roster.tell(wire.Stopping(pump.cell.stop_by))
