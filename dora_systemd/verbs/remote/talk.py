@@ -195,6 +195,7 @@ class Talks:
         self._is_full = is_full
         self._live: list[Talk] = []
         self._lost: set[Host] = set()
+        self._hangs_up = False
 
     @property
     def is_complete(self) -> bool:
@@ -223,10 +224,12 @@ class Talks:
         self._again.clear()
 
     def hang_up(self) -> None:
-        """Close the input of following commands, so that they end after their last output."""
-        self.begin_no_more()
-        for one in self._live:
-            one.connection.hang_up()
+        """Close the input of following commands, so that they end after their last output.
+
+        A handler of a signal may call this at any moment, so events() does it: no connection that
+        begins just now, and no host that is lost only afterwards, is followed for ever.
+        """
+        self._hangs_up = True
 
     def give_up(self, host: Host, error: DoraSystemdError) -> None:
         """End the connection to a host, with this error."""
@@ -238,11 +241,18 @@ class Talks:
         """Yield all events until all hosts have ended. Raises DoraSystemdError without ssh."""
         try:
             while self._waiting or self._live or self._again:
+                if self._hangs_up:
+                    self._end_all()
                 self._admit()
                 yield from self._turn()
         finally:
             for one in self._live:
                 one.connection.close()
+
+    def _end_all(self) -> None:
+        self.begin_no_more()
+        for one in self._live:
+            one.connection.hang_up()
 
     def _admit(self) -> None:
         while self._waiting and self._has_room():

@@ -301,3 +301,16 @@ touch "$0.lost"; {record} 7000001 one; exit 255""",
     assert err.startswith("doractl: the connection to h1 is lost")
     again = programs.read_text().splitlines()[-1]
     assert again.endswith("--since=@7.000002 -n all")
+
+
+def test_a_host_that_is_lost_after_ctrl_c_is_not_followed_again(programs: Path) -> None:
+    place = Path(os.environ["PATH"].partition(":")[0])
+    make_program(
+        place / "doractl",
+        f"""echo "$HOST" >>"$0.asked"
+trap 'exit 255' TERM
+[ "$HOST" = h2 ] || kill -INT {os.getpid()}
+while :; do sleep 0.1; done""",
+    )
+    assert main.run(["logs", "robot", "-f", "-H", "h1,h2"]) == ExitCode.INTERRUPTED
+    assert programs.read_text().count("h1\n") == 1
