@@ -30,6 +30,8 @@ PYPI = [
 # For nodes that say so by PYTHONPATH. pyarrow imports numpy where it finds it, and a node that
 # does not need it then takes twice as long to start: the system tests start 3,000 of them.
 NUMPY = "/opt/numpy"
+# pip installs it with dora-rs, which never imports it.
+UNUSED = ["numpy"]
 
 # What the product's package needs, and no more.
 PLATFORM_PACKAGES = [
@@ -72,7 +74,7 @@ def read_dependencies() -> list[str]:
 
 
 def base_key() -> str:
-    return digest(SUITE, PACKAGES, PYPI, NUMPY, read_part(HERE / "setup.sh"))
+    return digest(SUITE, PACKAGES, PYPI, NUMPY, UNUSED, read_part(HERE / "setup.sh"))
 
 
 def project_key(pyproject: str, sysusers: str) -> str:

@@ -50,6 +50,7 @@ def build_base(path: Path, log: Path) -> None:
         run_in_tree(path, ["pip", "install", "--no-cache-dir", *definition.PYPI], log)
         apart = ["--no-deps", f"--target={definition.NUMPY}"]
         run_in_tree(path, ["pip", "install", "--no-cache-dir", *apart, "numpy"], log)
+        run_in_tree(path, ["pip", "uninstall", "--yes", *definition.UNUSED], log)
     with Stage("users and units"):
         shutil.copy(definition.HERE / "setup.sh", path / "run/setup.sh")
         run_in_tree(path, ["sh", "/run/setup.sh"], log)

@@ -48,6 +48,11 @@ def test_python_has_dora() -> None:
     assert done.stdout == "1\n", done.stderr
 
 
+def test_python_has_no_numpy() -> None:
+    """pyarrow would import numpy, and each node then start for twice as long."""
+    assert run("python", "-c", "import numpy").returncode
+
+
 @pytest.mark.parametrize("user", ["alice", "bob", "dora"])
 def test_users_can_run_dora_and_read_the_checkout(user: str) -> None:
     done = run("setpriv", f"--reuid={user}", "--clear-groups", "dora", "--version")
