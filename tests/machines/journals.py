@@ -29,6 +29,7 @@ BUSY = (
     *("failed to send log message to dora-coordinator", "WS send channel closed"),
     "Received Data for unknown expr_id",
     *("failed to send heartbeat message to daemon", "daemons that failed watchdog"),
+    "has not stopped in its time",
 )
 """Of a machine that gives a node too little time within the grace, or systemd's last command, or
 whose daemon still has something to report when the coordinator of the head has ended, or receives a

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.lab.pace import bound
+from tests.lab.pace import bound, pace
 from tests.system.cells import Cell, Project, run, wait_for, wait_no_process
 from tests.system.complaints import complaints, end_of_journal
 from tests.system.openarm import (
@@ -35,6 +35,7 @@ NODES = (
 FRAMES = int(os.environ.get("FRAMES", "100"))
 """Of each camera in an episode that is compared, 20 a second."""
 NEAR = 0.03
+"""Of an idle machine. Cameras that wait for the processor miss frames by chance."""
 TRIES = 3
 CACHE = ("--property", "CacheDirectory=openarm", "--env", "UV_CACHE_DIR=/var/cache/openarm")
 ENV = [word for name, value in UV.items() for word in ("--env", f"{name}={value}")]
@@ -144,13 +145,14 @@ def record(*recorders: Recorder) -> list[Episode]:
 
 
 def are_alike(ours: Episode, bare: Episode) -> bool:
-    """Whether there are as many rows and frames, as often, and as few lost, within 3 %."""
+    """Whether there are as many rows and frames, as often, and as few lost, within NEAR."""
     pairs = (ours.counts(), bare.counts()), (ours.rates(), bare.rates())
     for name in ours.times:
         print(f"{name:12}", *(f"{one[name]:.2f}" for pair in pairs for one in pair))
     print("lost", ours.lost(), bare.lost())
-    most = NEAR * ours.counts()[STREAMS[0]]
-    return all(a == pytest.approx(b, rel=NEAR) for a, b in pairs) and all(
+    near = min(NEAR * pace(), 0.5)
+    most = near * ours.counts()[STREAMS[0]]
+    return all(a == pytest.approx(b, rel=near) for a, b in pairs) and all(
         count <= most for count in ours.lost().values()
     )
 

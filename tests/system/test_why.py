@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.errors import ExitCode
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, is_alive, run, sync_journal, wait_for
 from tests.system.terminal import shown
 
@@ -186,7 +187,7 @@ def test_a_start_that_took_too_long(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     project.write("late.py", LATE)
     flow.write_text(flow.read_text().rstrip() + "\n  - {id: late, path: late.py}\n")
-    done = cell.start(flow, "--start-timeout", "3s", check=False)
+    done = cell.start(flow, "--start-timeout", f"{bound(3)}s", check=False)
     assert f"doractl {cell.scope.flag} why {cell.name}" in done.stderr
     found = verdict(cell)
     assert (found["cause"], found["node"]) == ("start-timeout", "late")

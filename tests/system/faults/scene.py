@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, journalctl, run, wait_for
 
 ROLES = ("source", "doubler", "sink")
@@ -29,11 +30,6 @@ nodes:
 """
 IS_VM = os.environ.get("LAB") == "vm"
 """A kernel in user mode: programs start about four times slower."""
-
-
-def health(seconds: int) -> str:
-    """What a node's definition has more to be ended when it does not answer dora."""
-    return f"\n    health_check_timeout: {seconds}.0"
 
 
 @dataclass(frozen=True)
@@ -90,10 +86,12 @@ class Scene:
         """What the environment of every process of the cell has, wherever it has got to."""
         return f"NOTES={self.notes}"
 
-    def start(self, flags: tuple[str, ...], more: str) -> None:
-        """Start the dataflow, and return when all nodes are under load."""
+    def start(self, flags: tuple[str, ...], answers: float) -> None:
+        """Start the dataflow, and return when all nodes are under load. answers: see Fault."""
         shutil.copy(Path(__file__).with_name("node.py"), self.project.root)
-        text = FLOW.format(tick=200 if IS_VM else 10, more=more)
+        # A node that only gets no processor answers as late as everything else is there.
+        health = f"\n    health_check_timeout: {bound(answers):.1f}" if answers else ""
+        text = FLOW.format(tick=200 if IS_VM else 10, more=health)
         flow = self.project.write("dataflow.yml", text)
         self.cell.start(flow, "--env", self.mark, "--writable", str(self.notes), *flags)
         wait_for("load", lambda: min(self.counts().get(role, 0) for role in ROLES) > 20, 120)

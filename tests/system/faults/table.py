@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from tests.system.faults import apply
 from tests.system.faults.apply import Apply
 from tests.system.faults.checks import Outcome
-from tests.system.faults.scene import health
 
 ON_FAILURE = ("--restart-policy", "on-failure")
 ALWAYS = ("--restart-policy", "always")
@@ -35,9 +34,10 @@ class Fault:
     """One line of the table.
 
     seconds: within which the outcome is there. cause: what the journal says, and `list` of a
-    dataflow that has failed. warns: what the journal of the unit may warn of. more: what all nodes
-    have more in the dataflow file. repeats: lines that may be in the journal twice.
-    vm: needs controllers, or a kernel of its own. prepare: what is done before the start.
+    dataflow that has failed. warns: what the journal of the unit may warn of. answers: seconds of
+    an idle machine after which dora ends a node that does not answer; 0 for never. repeats: lines
+    that may be in the journal twice. vm: needs controllers, or a kernel of its own. prepare: what
+    is done before the start.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Fault:
     cause: str = ""
     flags: tuple[str, ...] = ON_FAILURE
     warns: tuple[str, ...] = ()
-    more: str = ""
+    answers: float = 0
     repeats: int = 0
     vm: bool = False
     prepare: Apply | None = None
@@ -85,14 +85,14 @@ NODES = (
     Fault(
         *("stop-node", apply.nodes(STOP, "doubler"), DORA, 20, "hangs"),
         warns=UNRESPONSIVE,
-        more=health(2),
+        answers=2,
     ),
     Fault("kill-nodes", apply.all_nodes(KILL), DORA, 12, "SIGKILL", warns=CRASHED),
     Fault("term-nodes", apply.all_nodes(TERM), DORA, 12, "SIGTERM", warns=CRASHED),
     Fault(
         *("stop-nodes", apply.all_nodes(STOP), DORA, 20, "hangs"),
         warns=UNRESPONSIVE,
-        more=health(2),
+        answers=2,
     ),
     Fault("node-exits-0", apply.death("source", "exit0"), ENDED, 8, "finished"),
     Fault("node-exits-0-always", apply.death("sink", "exit0"), DORA, 12, "", ALWAYS, CRASHED),
@@ -104,7 +104,7 @@ NODES = (
     Fault(
         *("node-spins", apply.order("sink", "spin"), DORA, 20, "hangs"),
         warns=UNRESPONSIVE,
-        more=health(2),
+        answers=2,
     ),
     Fault("node-floods", apply.order("sink", "flood"), UNAFFECTED, 30),
 )

@@ -19,7 +19,7 @@ def check_fault(scene: Scene, fault: Fault, recoveries: Recoveries) -> None:
     cell = scene.cell
     if fault.prepare is not None:
         fault.prepare(scene)
-    scene.start(fault.flags, fault.more)
+    scene.start(fault.flags, fault.answers)
     group = cell.group
 
     begun = time.monotonic()
