@@ -52,9 +52,14 @@ def test_an_idle_dataflow(cell: Cell, project: Project, flow: str, settings: str
     project.write("idle.py", IDLE)
     project.write("dataflow.systemd.yml", settings)
     cell.start(project.write("dataflow.yml", flow))
-    wait_for("samples are far apart", lambda: is_at_rest(cell), 90)
-    runner, last = cell.supervisor_pid("runner"), times(cell)[-1]
-    before = waits(runner)
-    wait_for("the next tick", lambda: times(cell)[-1] != last, 60)
-    assert is_at_rest(cell)
-    assert waits(runner) - before <= MOST
+    runner = cell.supervisor_pid("runner")
+
+    def is_woken_by_the_tick_only() -> bool:
+        before, last = waits(runner), times(cell)[-1:]
+        wait_for("the next sample", lambda: times(cell)[-1:] != last, 60)
+        found = waits(runner) - before
+        print(last, times(cell), found)
+        return is_at_rest(cell) and found <= MOST
+
+    # A machine that is busy may write a line, or take CPU time for pages, in one of the periods.
+    wait_for("a period at rest", is_woken_by_the_tick_only, 120)
