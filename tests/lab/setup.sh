@@ -39,3 +39,10 @@ systemctl mask \
     ssh.service ssh.socket systemd-random-seed.service systemd-timesyncd.service systemd-update-done.service
 journalctl --update-catalog
 touch /etc/.updated /var/.updated
+
+# Each reload of systemd's configuration runs all generators, a process each; one of them may matter.
+install -d /etc/systemd/system-generators
+for generator in /usr/lib/systemd/system-generators/*; do
+    [ "${generator##*/}" = systemd-fstab-generator ] ||
+        ln -s /dev/null "/etc/systemd/system-generators/${generator##*/}"
+done
