@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from signal import Signals, pidfd_send_signal
+from signal import SIGKILL, Signals, pidfd_send_signal
 
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -32,6 +32,7 @@ MAX_PROCESSES = 5000
 """Maximum processes to count one by one without a memory controller."""
 _MAX_ENTRIES = 10_000
 _CHUNK = 1 << 14
+_MOST_FORKS = 100
 _SHORT = 2048
 """Bytes of a read of a control file that is the last one: if more is to come, the kernel returns
 nearly a page, and a line is shorter than the rest of it."""
@@ -325,10 +326,22 @@ def signal_group(
 ) -> None:
     """Send a signal to all processes of the group and below it, to process `first` before others.
 
-    A process that leaves the group meanwhile, or takes over a pid, gets none. is_in: whether a
-    process is in a group.
+    is_in: whether a process is in a group.
     """
-    for pid in sorted(pids(path), key=lambda pid: pid != first):
+    signal_processes(path, number, sorted(pids(path), key=lambda pid: pid != first), is_in)
+
+
+def signal_processes(
+    path: Path,
+    number: Signals,
+    some: Iterable[int],
+    is_in: Callable[[Path, int], bool] = is_member,
+) -> None:
+    """Send a signal to some processes of the group and below it, in this order.
+
+    A process that leaves the group meanwhile, or takes over a pid, gets none. is_in: as above.
+    """
+    for pid in some:
         with contextlib.suppress(OSError):
             pidfd = os.pidfd_open(pid)
             try:
@@ -336,6 +349,24 @@ def signal_group(
                     pidfd_send_signal(pidfd, number)
             finally:
                 os.close(pidfd)
+
+
+def kill_left(
+    path: Path, is_old: Callable[[], bool], is_in: Callable[[Path, int], bool] = is_member
+) -> None:
+    """Kill what an ended process has left in the group and below it, and no process that enters it.
+
+    is_old: whether nothing has entered the group until now. cgroup.kill would also end what enters
+    just now, so it is only for what forks faster than it is killed. is_in: as above.
+    """
+    killed = set[int]()
+    for _ in range(_MOST_FORKS):
+        left = [one for one in pids(path) if one not in killed]
+        if not left or not is_old():
+            return
+        signal_processes(path, SIGKILL, left, is_in)
+        killed.update(left)
+    kill_group(path)
 
 
 def find_groups(is_wanted: Callable[[str], object], most: int) -> list[str]:

@@ -208,16 +208,13 @@ class Nodes:
                     lower_rights(process, node, rights)
 
     def clear(self, node: str, pid: int) -> None:
-        """Kill what the crashed process `pid` has left of the node, before its next process starts.
+        """Kill what the crashed process `pid` has left of the node, and not its next process.
 
         Remaining processes would count against the limits of the next one, and may hold its
-        resources.
+        resources. The launcher of the next one notes its pid before it enters the group.
         """
-        if node not in self._launched:
-            return
-        with contextlib.suppress(OSError):
-            if self.noted_pid(node) == pid:  # else the next one runs
-                cgroup.kill_group(self._group(node))
+        if node in self._launched:
+            cgroup.kill_left(self._group(node), lambda: self.noted_pid(node) == pid)
 
     def has_gate_for(self, node: str) -> bool:
         """Whether the launcher of the node can wait at a gate."""

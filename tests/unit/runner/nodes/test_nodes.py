@@ -7,9 +7,11 @@ import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from signal import SIGKILL
 
 import pytest
 
+from dora_systemd.adapters.cgroup.groups import kill_left
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.logs.lines import Origin
@@ -167,3 +169,21 @@ def test_a_node_that_is_taken_back_is_held_as_before(tmp_path: Path) -> None:
         assert freeze.read_text() == "0"
 
     asyncio.run(live())
+
+
+def test_what_enters_a_group_while_it_is_cleared_lives(tmp_path: Path) -> None:
+    left, fork, entering = [subprocess.Popen(["sleep", "60"]) for _ in range(3)]
+    procs = tmp_path / "cgroup.procs"
+    procs.write_text(f"{left.pid}\n")
+    later = iter([(True, fork), (True, entering), (False, entering)])
+
+    def is_old() -> bool:
+        answer, child = next(later)
+        with procs.open("a") as file:
+            print(child.pid, file=file)
+        return answer
+
+    kill_left(tmp_path, is_old, lambda *_: True)
+    assert [left.wait(), fork.wait(), entering.poll()] == [-SIGKILL, -SIGKILL, None]
+    entering.kill()
+    entering.wait()
