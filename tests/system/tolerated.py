@@ -41,6 +41,7 @@ TOLERATED = (
     Word("Unknown token", _ORDER, is_all=True),
     Word("Unknown wire expr", _ORDER, is_all=True),
     Word("Unknown id", _ORDER, is_all=True),  # of a queryable
+    Word("Route data with unknown scope", _ORDER),
     Word("[Gossip] Received LinkStateList from unknown link", _ORDER),
     Word("Attempt to establish transport to itself", _ORDER),
     Word("zenoh teardown timed out", _SLOW),
