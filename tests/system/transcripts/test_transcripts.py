@@ -23,11 +23,26 @@ pytestmark = pytest.mark.lab
 HERE = Path(__file__).parent
 PLACE = Path("/srv/robot")
 ELSEWHERE = ("reboot", "uninstall")
+MODULES = Path("/opt/numpy")
+"""What the nodes of the robot import and others do not, see tests/lab/definition.py."""
 TASKS = [path for path in sorted(HERE.glob("*.txt")) if path.stem not in ELSEWHERE]
 
 
+@pytest.fixture(scope="module")
+def numpy() -> Iterator[None]:
+    """As on a machine where numpy was installed with dora-rs."""
+    places = Path("/opt/lab/lib").glob("python3*/site-packages") if MODULES.exists() else ()
+    links = [place / one.name for place in places for one in MODULES.glob("numpy*")]
+    for link in links:
+        link.symlink_to(MODULES / link.name)
+    yield
+    for link in links:
+        link.unlink()
+
+
 @pytest.fixture
-def shell() -> Iterator[Shell]:
+def shell(numpy: None) -> Iterator[Shell]:
+    del numpy
     shutil.copytree(ROBOT, PLACE)
     run("chmod", "--recursive", "a+rX", str(PLACE))
     run("journalctl", "--quiet", "--rotate")
