@@ -17,6 +17,7 @@ from dora_systemd.decisions.properties.table import TABLE_VERSION
 from tests.deb.packages import install
 from tests.platforms.table import HERE
 from tests.system.cells import Project, dora_processes, run, wait_for, wait_no_process
+from tests.system.ports import reserve_ports
 from tests.system.recorders import COUNTING, counted
 from tests.system.tolerated import is_tolerated
 
@@ -30,6 +31,7 @@ PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 @pytest.fixture(scope="module", autouse=True)
 def installed() -> None:
     """There is no network here: nothing else may be needed."""
+    reserve_ports()
     install()
 
 
