@@ -15,7 +15,7 @@ import termios
 import tty
 from collections.abc import Iterator, Mapping, Sequence
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from dora_systemd.errors import ExitCode
 from dora_systemd.trust.programs import Account, become
@@ -32,14 +32,19 @@ def run_apart(command: Sequence[str], environment: Mapping[str, str], account: A
 
     Its standard streams are the caller's, except for those that are a terminal. Raises OSError.
     """
+    screen = next((fd for fd in (1, 2, 0) if os.isatty(fd)), None)
+    mode = termios.tcgetattr(0) if os.isatty(0) else None
     ours, theirs = os.openpty()
+    # Before the program starts, which may read both at once.
+    _copy_size(screen, ours)
+    if mode is not None:
+        termios.tcsetattr(ours, termios.TCSANOW, mode)
     child = os.fork()
     if child == 0:
         _become_program(command, environment, account, theirs)
     os.close(theirs)
-    screen = next((fd for fd in (1, 2, 0) if os.isatty(fd)), None)
     try:
-        with _woken() as wake, _carried(child, ours, screen):
+        with _woken() as wake, _carried(child, ours, screen, mode):
             _carry(child, ours, screen, wake)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     finally:
@@ -81,8 +86,11 @@ def _woken() -> Iterator[int]:
 
 
 @contextlib.contextmanager
-def _carried(child: int, ours: int, screen: int | None) -> Iterator[None]:
-    """Set our terminal to raw mode, and pass on its size and our signals."""
+def _carried(child: int, ours: int, screen: int | None, mode: list[Any] | None) -> Iterator[None]:
+    """Set our terminal to raw mode, and pass on its size and our signals.
+
+    mode: that of our terminal, or None without one.
+    """
 
     def hand_on(number: int, _frame: FrameType | None) -> None:
         if number == signal.SIGWINCH:
@@ -93,10 +101,8 @@ def _carried(child: int, ours: int, screen: int | None) -> Iterator[None]:
     numbers = (signal.SIGWINCH, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {number: signal.signal(number, hand_on) for number in numbers}
     _copy_size(screen, ours)
-    mode = termios.tcgetattr(0) if os.isatty(0) else None
     try:
         if mode is not None:
-            termios.tcsetattr(ours, termios.TCSANOW, mode)
             tty.setraw(0)
         yield
     finally:
