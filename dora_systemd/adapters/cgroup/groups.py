@@ -336,19 +336,24 @@ def signal_processes(
     number: Signals,
     some: Iterable[int],
     is_in: Callable[[Path, int], bool] = is_member,
-) -> None:
+) -> bool:
     """Send a signal to some processes of the group and below it, in this order.
 
-    A process that leaves the group meanwhile, or takes over a pid, gets none. is_in: as above.
+    A process that leaves the group meanwhile, or takes over a pid, gets none. Return whether none
+    of them is another user's, to whom this process may send no signal. is_in: as above.
     """
+    is_ours = True
     for pid in some:
         with contextlib.suppress(OSError):
             pidfd = os.pidfd_open(pid)
             try:
                 if is_in(path, pid):
                     pidfd_send_signal(pidfd, number)
+            except PermissionError:
+                is_ours = False
             finally:
                 os.close(pidfd)
+    return is_ours
 
 
 def kill_left(
@@ -357,14 +362,16 @@ def kill_left(
     """Kill what an ended process has left in the group and below it, and no process that enters it.
 
     is_old: whether nothing has entered the group until now. cgroup.kill would also end what enters
-    just now, so it is only for what forks faster than it is killed. is_in: as above.
+    just now, so it is only for what forks faster than it is killed, and for programs that have
+    another user's rights (setuid). is_in: as above.
     """
     killed = set[int]()
     for _ in range(_MOST_FORKS):
         left = [one for one in pids(path) if one not in killed]
         if not left or not is_old():
             return
-        signal_processes(path, SIGKILL, left, is_in)
+        if not signal_processes(path, SIGKILL, left, is_in):
+            break
         killed.update(left)
     kill_group(path)
 

@@ -187,3 +187,15 @@ def test_what_enters_a_group_while_it_is_cleared_lives(tmp_path: Path) -> None:
     assert [left.wait(), fork.wait(), entering.poll()] == [-SIGKILL, -SIGKILL, None]
     entering.kill()
     entering.wait()
+
+
+def test_what_may_get_no_signal_of_ours_is_killed_by_the_kernel(tmp_path: Path) -> None:
+    """A program with the rights of another user: pidfd_send_signal(2) is refused."""
+
+    def refuse(*_: object) -> bool:
+        raise PermissionError
+
+    (tmp_path / "cgroup.procs").write_text(f"{os.getpid()}\n")
+    (tmp_path / "cgroup.kill").touch()
+    kill_left(tmp_path, lambda: True, refuse)
+    assert (tmp_path / "cgroup.kill").read_text() == "1"
