@@ -213,7 +213,9 @@ class Nodes:
         Remaining processes would count against the limits of the next one, and may hold its
         resources. The launcher of the next one notes its pid before it enters the group.
         """
-        if node in self._launched:
+        if node not in self._launched:
+            return
+        with contextlib.suppress(OSError):
             cgroup.kill_left(self._group(node), lambda: self.noted_pid(node) == pid)
 
     def has_gate_for(self, node: str) -> bool:
