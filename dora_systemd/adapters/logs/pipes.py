@@ -61,6 +61,7 @@ class LogPipes:
         self._paths: dict[str, CellPaths] = {}
         self._sources: dict[str, Source] = {}
         self._outputs: dict[int, LineSplitter] = {}
+        self._readers: dict[str, tuple[int, OnLine]] = {}  # file descriptor and on_line, by label
         self.left_out: tuple[bytes, ...] = ()  # lines that contain one of these are left out
         self._muted: frozenset[str] = frozenset()
         self._asked: set[str] = set()  # nodes whose end was requested
@@ -215,10 +216,19 @@ class LogPipes:
         Warnings and errors become records of `label`; on_line gets every line, without newline.
         """
         os.set_blocking(fd, False)
-        self._outputs[fd] = LineSplitter()
+        self._outputs[fd], self._readers[label] = LineSplitter(), (fd, on_line)
         self._loop.add_reader(fd, self._read_output, label, fd, on_line)
         if said:
             self._loop.call_soon(self._read_output, label, fd, on_line, said)
+
+    def read_output(self, label: str) -> None:
+        """Read at once what a child has printed, at most a full pipe.
+
+        For a line that explains what is about to be handled, and may still be in the pipe.
+        """
+        for _ in range(PIPE_SIZE // CHUNK):
+            if label not in self._readers or not self._read_output(label, *self._readers[label]):
+                return
 
     def mute(self, *labels: str) -> None:
         """Write no records of what these children print; replaces the labels given before."""
@@ -302,11 +312,12 @@ class LogPipes:
             limit = format_rate(source.limit)
             self.write_event("lines-suppressed", node_id, count=count, limit=limit)
 
-    def _read_output(self, label: str, fd: int, on_line: OnLine, said: bytes = b"") -> None:
+    def _read_output(self, label: str, fd: int, on_line: OnLine, said: bytes = b"") -> bool:
+        """Read a chunk of what a child has printed. Return whether there was one."""
         try:
             data = said or os.read(fd, CHUNK)
         except BlockingIOError:
-            return
+            return False
         for line in self._outputs[fd].feed(data) if data else self._outputs[fd].flush():
             is_muted = label in self._muted or any(map(line.__contains__, self.left_out))
             fields = None if is_muted else dora_log_fields(line)
@@ -316,8 +327,10 @@ class LogPipes:
                 on_line(line.decode("utf-8", "replace"))
         if not data:
             self._end_output(fd)
+        return bool(data)
 
     def _end_output(self, fd: int) -> None:
         self._loop.remove_reader(fd)
         del self._outputs[fd]
+        self._readers = {label: one for label, one in self._readers.items() if one[0] != fd}
         os.close(fd)

@@ -107,6 +107,11 @@ class NodeHung(Event):
     record: str = "node-hung"
     details: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def is_of_watchdog(self) -> bool:
+        """Whether the node's watchdog ends it, and not dora's health check."""
+        return self.record == "node-watchdog"
+
 
 @dataclass(frozen=True)
 class NodeSilent(Event):

@@ -227,9 +227,15 @@ def _met(nodes: NodeTable, event: life.NodeMet) -> Change:
 
 
 def _hung(nodes: NodeTable, event: life.NodeHung) -> Change:
+    """Record why a process is ended, for its exit. A process that has ended leaves no reason.
+
+    dora's health check ends only processes that are ready: of another one the event comes too late.
+    """
     if event.node not in nodes:
         return nodes, None
-    nodes = {**nodes, event.node: nodes[event.node]._replace(hung=event.reason)}
+    old = nodes[event.node]
+    if event.is_of_watchdog or old.is_alive:
+        nodes = {**nodes, event.node: old._replace(hung=event.reason)}
     return nodes, Record(event.record, event.node, {"reason": event.reason, **event.details})
 
 

@@ -195,6 +195,7 @@ class Dialogue(Tasks):
         if isinstance(event, life.NodeSpawned):
             self._nodes.adopt(event.node, event.pid, rights_of(self._options))
         if isinstance(event, life.NodeExited):
+            self._pipes.read_output("daemon")  # it has printed before why it killed the node
             is_running = self._pump.cell.state is State.RUNNING
             (self._hold_exit if is_running else self._exited)(event)
         elif event is not None:

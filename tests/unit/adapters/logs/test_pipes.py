@@ -313,6 +313,29 @@ def test_output_that_was_read_before_comes_first(tmp_path: Path) -> None:
     run(tmp_path, scenario)
 
 
+def test_output_is_read_at_once_if_it_explains_something(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        (reader, writer), lines = os.pipe(), list[str]()
+        cell.pipes.read_output("daemon")
+        cell.pipes.add_output("daemon", reader, lines.append)
+        os.set_blocking(writer, False)
+        printed = os.write(writer, b"a line\n" * 10_000)
+        cell.pipes.read_output("daemon")
+        assert len(lines) == printed // len("a line\n"), "all that a pipe can have"
+        cell.pipes.read_output("daemon")
+        os.write(writer, b"rest")
+        os.close(writer)
+        cell.pipes.read_output("daemon")
+        assert lines[-1].endswith("rest")
+        other, writer = os.pipe()
+        assert other == reader, "closed at the end"
+        cell.pipes.add_output("coordinator", other)
+        cell.pipes.read_output("daemon")
+        os.close(writer)
+
+    run(tmp_path, scenario)
+
+
 def test_close_counts_what_it_cannot_write(tmp_path: Path) -> None:
     async def scenario(cell: Cell) -> None:
         cell.node("a")

@@ -106,6 +106,21 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
         RUNS._replace(hung="unresponsive"),
         (Record("node-watchdog", "a", {"reason": "unresponsive", "limit": "5s"}),),
     ),
+    "found to hang by dora": (
+        RUNS,
+        life.NodeHung(20, "a", "unresponsive"),
+        RUNS._replace(hung="unresponsive"),
+        (Record("node-hung", "a", {"reason": "unresponsive"}),),
+    ),
+    **{
+        f"found to hang by dora, but {state} by now": (
+            RUNS._replace(state=state, pid=pid),
+            life.NodeHung(20, "a", "unresponsive"),
+            RUNS._replace(state=state, pid=pid),
+            (Record("node-hung", "a", {"reason": "unresponsive"}),),
+        )
+        for state, pid in (("restarting", 0), ("starting", 8), ("reloading", 7), ("failed", 0))
+    },
     "the end of a hung one": (
         RUNS._replace(hung="unresponsive"),
         exited(exit_of(-9)),

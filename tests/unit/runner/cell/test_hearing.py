@@ -1,12 +1,14 @@
 """What dora tells of the nodes, and what is done about it before it becomes an event."""
 
 import asyncio
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from dora_systemd.decisions.cell.exits import Exit, exit_of
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.exits import Exit, ExitKind, exit_of
 from dora_systemd.decisions.cell.extra import PROBE, extra_id
 from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.rights import NodeRights
@@ -17,7 +19,7 @@ from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.runner.cell.pump import Pump
 from tests.unit.fakes.dialogue import OPTIONS, Bench, Heard
-from tests.unit.fakes.loop import live
+from tests.unit.fakes.loop import live, settle
 from tests.unit.fakes.manager import with_owes, with_rights
 from tests.unit.fakes.run import Calls
 
@@ -75,6 +77,31 @@ def test_what_a_crashed_node_has_left_goes_before_the_next_one(tmp_path: Path) -
         done = await hear(bench, EXITED.format("true"), NEXT)
         assert done == [("clear", "a", 7), ("push", "NodeExited"), ("forget", "a")]
         assert bench.heard == [life.NodeExited(0, "a", exit_of(1), True)]
+
+    live(work)
+
+
+HANGS = "unresponsive for 5322ms (timeout: 5s)"
+
+
+def test_the_daemon_says_why_it_killed_a_node_before_the_exit(tmp_path: Path) -> None:
+    """Its line and dora's records take two ways, and the runner may find both at once."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path, kind=Taking)
+        reader, writer = os.pipe()
+        LogPipes.add_output(bench.pipes, "daemon", reader, bench.dialogue._read_daemon)
+        await bench.do(Do.SUBSCRIBE)
+        assert bench.dora.hear is not None
+        os.write(writer, f" WARN dora_daemon: node `a` {HANGS}, killing\n".encode())
+        for message in (STOPPED.format("Signal(9)", "true)"), NEXT, "spawned node with pid 8"):
+            bench.dora.hear(LogRecord("INFO", "daemon", "a", message))
+        await settle()
+        node = bench.pump.cell.nodes["a"]
+        assert (node.exit, node.hung) == (Exit(ExitKind.HUNG, words=HANGS), "")
+        assert (node.state, node.pid) == ("starting", 8)
+        os.close(writer)
+        await settle()
 
     live(work)
 
