@@ -166,7 +166,7 @@ def _asked(nodes: NodeTable, event: life.NodeAsked) -> Change:
         return {**nodes, event.node: old._replace(restarts=0)}, record
     else:
         state = "starting" if is_stopped(old) else "reloading"
-        new = (event.status or old._replace(restarts=0))._replace(
+        new = (event.status or old._replace(restarts=0, hung=""))._replace(
             state=state, pid=old.pid, since_us=event.at_us
         )
         new = new._replace(machine=old.machine)
@@ -296,7 +296,7 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
     if event.is_stale and not event.will_restart:
         return nodes, None  # a newer process has replaced it
     if event.is_stale:  # dora reported the exit after it had executed the next one
-        nodes = {**nodes, event.node: old._replace(restarts=old.restarts + 1)}
+        nodes = {**nodes, event.node: old._replace(restarts=old.restarts + 1, hung="")}
         return nodes, record
     nodes = _set(
         nodes,

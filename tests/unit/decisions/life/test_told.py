@@ -192,6 +192,12 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
         ),
         (Record("node-asked", "a", {"asked": RESTART, "by": BY}),),
     ),
+    "a restart of one that its watchdog ends is asked for": (
+        RUNS._replace(hung="no WATCHDOG=1 for 5s"),
+        life.NodeAsked(20, "a", RESTART, BY),
+        RELOADS._replace(since_us=20, restarts=0, asked=RESTART, asked_by=BY),
+        (Record("node-asked", "a", {"asked": RESTART, "by": BY}),),
+    ),
     "a restart with another status is asked for": (
         RUNS,
         life.NodeAsked(20, "a", RESTART, BY, NodeStatus(kind="uv")),
@@ -254,6 +260,12 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
         exited(again=True, is_stale=True),
         RUNS._replace(restarts=2),
         (crashed(), RESTARTED),
+    ),
+    "a stale exit of a hung one before a restart": (
+        RUNS._replace(hung="unresponsive"),
+        exited(exit_of(-9), again=True, is_stale=True),
+        RUNS._replace(restarts=2),
+        (crashed({"exit": "hung, unresponsive"}, "node-ended"), RESTARTED),
     ),
     "the end of the process before, after that of the new one": (
         RUNS._replace(state="failed", pid=0, exit=CRASH, policy="never"),
