@@ -90,7 +90,7 @@ class Dialogue(Tasks):
         if (sockets := self._nodes.notify_sockets) is not None:
             from dora_systemd.runner.nodes.watchdog import WatchdogTimers
 
-            timers = WatchdogTimers(sockets, self._pump, self._nodes.is_blocked, self._options)
+            timers = WatchdogTimers(sockets, self._pump, self._nodes, self._options)
             self.spawn("watch over its nodes", timers.run())
 
     def _ask(self, what: Do, work: Coroutine[Any, Any, None]) -> None:

@@ -207,8 +207,14 @@ class Nodes:
                 if rights and node in self._bare:
                     lower_rights(process, node, rights)
 
+    def find_own(self, node: str, pid: int) -> list[int]:
+        """Find the processes of the node, `pid` first; none if its next process has started."""
+        own = sorted(cgroup.pids(self._group(node)), key=lambda one: one != pid)
+        # The launcher of the next one notes its pid before it enters the group.
+        return own if self.noted_pid(node) == pid else []
+
     def clear(self, node: str, pid: int) -> None:
-        """Kill what the crashed process `pid` has left of the node, and not its next process.
+        """Kill the process `pid` of the node or what that has left, and not its next process.
 
         Remaining processes would count against the limits of the next one, and may hold its
         resources. The launcher of the next one notes its pid before it enters the group.

@@ -8,13 +8,13 @@ node by its policy, as after any other crash.
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from signal import SIGABRT, Signals
 from typing import Protocol
 
-from dora_systemd.adapters.cgroup.groups import NODE_PREFIX, is_member, kill_group, signal_group
+from dora_systemd.adapters.cgroup.groups import NODE_PREFIX, is_member, signal_processes
 from dora_systemd.adapters.host.notify_socket import NotifySocket, Pending
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus
@@ -44,9 +44,6 @@ _REFUSALS = 60 * SECOND
 """µs between two events about refused messages, for each node."""
 _PUBLISH_SECONDS = 1.0
 """Shortest time between two tables that are written because of nodes' messages."""
-
-IsBlocked = Callable[[str], bool]
-"""Whether a node may have to wait for the journal."""
 
 
 def monotonic_us() -> int:
@@ -209,20 +206,36 @@ class Pump(Protocol):
         """Write the table that `list` reads."""
 
 
+class Processes(Protocol):
+    """The part of runner.nodes.nodes.Nodes that WatchdogTimers uses."""
+
+    def is_blocked(self, node: str) -> bool:
+        """Whether the node may have to wait for the journal."""
+
+    def find_own(self, node: str, pid: int) -> list[int]:
+        """Find the processes of the node, unless its next process has replaced `pid`."""
+
+    def clear(self, node: str, pid: int) -> None:
+        """Kill the processes of the node, unless its next process has replaced `pid`."""
+
+
 class WatchdogTimers:
-    """Checks the watchdogs of the nodes of one run. send: sends a signal to a cgroup."""
+    """Checks the watchdogs of the nodes of one run. send: sends a signal to processes of a cgroup.
+
+    dora may have replaced a process before the runner learns of that: the next process is spared.
+    """
 
     def __init__(
         self,
         sockets: NotifySockets,
         pump: Pump,
-        is_blocked: IsBlocked,
+        processes: Processes,
         options: RunnerOptions,
-        send: Callable[[Path, Signals, int], None] = signal_group,
+        send: Callable[[Path, Signals, Iterable[int]], object] = signal_processes,
     ) -> None:
         self._sockets = sockets
         self._pump = pump
-        self._is_blocked = is_blocked
+        self._processes = processes
         self._options = options
         self._send = send
         self._loop = asyncio.get_running_loop()
@@ -262,7 +275,7 @@ class WatchdogTimers:
     def _look_at(self, node: str, entry: NodeSocket, now: int) -> None:
         phase, pid = self._phase(self._pump.cell.nodes.get(node))
         watch = self._watches.get(node, Watch()).of(phase, pid, entry.signed, now)
-        if self._is_blocked(node):
+        if self._processes.is_blocked(node):
             watch = watch.excused(now)
         limit = limit_in(phase, entry.limit, self._options.start_timeout)
         act = watch.act(limit, self._options.grace, now)
@@ -271,12 +284,12 @@ class WatchdogTimers:
             watch = watch.of(phase, pid, entry.signed, now)
             act = watch.act(limit, self._options.grace, now)
         is_asked = entry.is_triggered and watch.is_awake
-        if act is Act.ABORT or is_asked:
-            watch = watch._replace(aborted=now)
-            self._abort(node, entry, pid, TRIGGERED if is_asked else missed(phase, limit))
-        elif act is Act.KILL:
+        if act is Act.KILL:
             watch = watch._replace(is_killed=True)
-            kill_group(self._sockets.group(node))
+            self._processes.clear(node, pid)
+        elif (act is Act.ABORT or is_asked) and (own := self._processes.find_own(node, pid)):
+            watch = watch._replace(aborted=now)
+            self._abort(node, entry, own, TRIGGERED if is_asked else missed(phase, limit))
         self._watches[node] = watch
 
     def _phase(self, status: NodeStatus | None) -> tuple[Phase, int]:
@@ -287,8 +300,8 @@ class WatchdogTimers:
         phase = phases.get(status.state, Phase.AWAY)
         return phase, status.pid if phase is not Phase.AWAY else 0
 
-    def _abort(self, node: str, entry: NodeSocket, pid: int, reason: str) -> None:
+    def _abort(self, node: str, entry: NodeSocket, own: list[int], reason: str) -> None:
         details = {"status": entry.status} if entry.status else {}
         at_us = time.time_ns() // 1000
         self._pump.push(life.NodeHung(at_us, node, reason, "node-watchdog", details))
-        self._send(self._sockets.group(node), SIGABRT, pid)
+        self._send(self._sockets.group(node), SIGABRT, own)

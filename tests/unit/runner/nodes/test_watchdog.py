@@ -8,13 +8,12 @@ import struct
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, closing
 from dataclasses import replace
 from errno import EINVAL, EPERM, ESRCH
 from pathlib import Path
-from signal import SIGABRT, Signals
-from typing import Any
+from signal import SIGABRT, SIGKILL, Signals
 
 import pytest
 
@@ -24,6 +23,7 @@ from dora_systemd.adapters.host.notify_socket import NotifySocket
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.logs.lines import Origin
@@ -32,7 +32,7 @@ from dora_systemd.decisions.watchdog.watchdogs import Watchdogs
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes.nodes import Nodes
-from dora_systemd.runner.nodes.watchdog import NotifySockets, WatchdogTimers
+from dora_systemd.runner.nodes.watchdog import NotifySockets, Processes, WatchdogTimers
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.dialogue import OPTIONS, Bench
@@ -252,35 +252,49 @@ def test_a_sender_that_gets_no_signal_of_ours(
 LIMIT = 4 * SECOND
 
 
-class Watched(Bench):
-    """A node "a" with pid 7. now: CLOCK_MONOTONIC µs."""
+class FakeProcesses:
+    """A node "a" whose process has the pid `now`. done: what was sent to the node."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self) -> None:
+        self.now, self.is_busy = 7, False
+        self.done: list[tuple[Signals, int]] = []
+
+    def is_blocked(self, node: str) -> bool:
+        del node
+        return self.is_busy
+
+    def find_own(self, node: str, pid: int) -> list[int]:
+        del node
+        return [pid] * (pid == self.now)
+
+    def clear(self, node: str, pid: int) -> None:
+        self.done += [(SIGKILL, one) for one in self.find_own(node, pid)]
+
+    def send(self, _group: Path, number: Signals, some: Iterable[int]) -> None:
+        self.done += [(number, one) for one in some]
+
+
+class Watched(Bench):
+    """A node "a" with pid 7. now: CLOCK_MONOTONIC µs. given: its processes, if they are real."""
+
+    def __init__(self, root: Path, given: Callable[[LogPipes], Processes] | None = None) -> None:
         super().__init__(root)
         self.now = SECOND
-        self.signals: list[tuple[Signals, int]] = []
-        self.kill_file = root / "node-a/cgroup.kill"
-        self.kill_file.parent.mkdir()
-        self.kill_file.touch()
+        self.processes = FakeProcesses()
         paths = CellPaths(root)
-        paths.io.mkdir()
+        paths.io.mkdir(exist_ok=True)
         tell = self.pipes.write_event
         sockets = NotifySockets({"a": LIMIT}, root, paths, tell, clock_us=lambda: self.now)
         sockets.make("a")
-        self.sockets, self.nodes.notify_sockets, self.is_blocked = sockets, sockets, False
+        self.sockets, self.nodes.notify_sockets = sockets, sockets
         options = OPTIONS._replace(grace=2 * SECOND)
-        self.watch = WatchdogTimers(
-            sockets, self.pump, lambda _: self.is_blocked, options, self.send
-        )
+        processes = given(self.pipes) if given else self.processes
+        self.watch = WatchdogTimers(sockets, self.pump, processes, options, self.processes.send)
         ((_, self.socket),) = sockets.items()
 
-    def send(self, _group: Path, number: Signals, first: int) -> None:
-        self.signals.append((number, first))
-
     @property
-    def done(self) -> list[Any]:
-        """The signals, and the name of the group if it was killed."""
-        return [*self.signals, *["node-a"] * (self.kill_file.read_text() == "1")]
+    def done(self) -> list[tuple[Signals, int]]:
+        return self.processes.done
 
     def close(self) -> None:
         """Leave no socket."""
@@ -309,7 +323,38 @@ def test_a_silent_node_is_ended_then_killed(tmp_path: Path) -> None:
             reason, details = "no WATCHDOG=1 for 4s", {"status": "up"}
             assert one.heard == [life.NodeHung(0, "a", reason, "node-watchdog", details)]
             one.passes(10)
-            assert one.done == [(SIGABRT, 7), "node-a"], "it has not ended by itself"
+            assert one.done == [(SIGABRT, 7), (SIGKILL, 7)], "it has not ended by itself"
+
+    live(work)
+
+
+def test_the_next_process_is_spared(tmp_path: Path) -> None:
+    """dora has replaced the process, and the runner learns of it later."""
+    (tmp_path / "io").mkdir()
+    group, note = tmp_path / "node-a", CellPaths(tmp_path).node_pid("a")
+    dataflow = parse_dataflow({"nodes": [{"id": "a", "path": "a.py"}]}, "dataflow.yml")
+
+    def prepare(pipes: LogPipes) -> Nodes:
+        nodes = Nodes(tmp_path, CellPaths(tmp_path), pipes)
+        nodes.prepare(dataflow, {}, ())
+        return nodes
+
+    def enter(*pids: int) -> None:
+        note.write_text(f"{pids[0]}\n")
+        (group / "cgroup.procs").write_text("".join(f"{pid}\n" for pid in sorted(pids)))
+
+    async def work() -> None:
+        with closing(Watched(tmp_path, prepare)) as one:
+            (group / "cgroup.kill").touch()
+            enter(8)
+            one.passes(5)
+            assert (one.heard, one.done) == ([], []), "it has missed nothing"
+            enter(7, 6)
+            one.passes(1)
+            assert one.done == [(SIGABRT, 7), (SIGABRT, 6)]
+            enter(8, 6)
+            one.passes(100)
+            assert (one.done[2:], (group / "cgroup.kill").read_text()) == ([], "")
 
     live(work)
 
@@ -354,9 +399,9 @@ def test_a_start_that_takes_too_long(tmp_path: Path) -> None:
 def test_a_node_that_waits_for_the_journal(tmp_path: Path) -> None:
     async def work() -> None:
         with watched(tmp_path) as one:
-            one.is_blocked = True
+            one.processes.is_busy = True
             one.passes(100)
-            one.is_blocked = False
+            one.processes.is_busy = False
             one.passes(3.5)
             assert one.done == []
             one.passes(1)
