@@ -31,7 +31,7 @@ from dora_systemd.decisions.cell.status import (
 )
 from dora_systemd.decisions.cell.stops import within_of
 from dora_systemd.decisions.dora import protocol
-from dora_systemd.decisions.dora.life_events import refused_restart
+from dora_systemd.decisions.dora.life_events import refused_request
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.node_table import held, is_over_but_for_held
 from dora_systemd.decisions.life.states import Cell, State
@@ -66,10 +66,17 @@ class Hand:
     async def stop(self, target: Target) -> None:
         """End a node, so that bring_back() can start it again. Raises DoraSystemdError."""
         with self.run.nodes.exchanging(target.node):
-            if self._can_hold(target):
-                await self._hold(target)
-            else:
-                await self._remove(target)
+            try:
+                await (self._hold(target) if self._can_hold(target) else self._remove(target))
+            except DoraSystemdError:
+                self._undo(target.node)
+                raise
+
+    def _undo(self, node: str) -> None:
+        """Forget a stop that dora has refused: the gate would stop the next process."""
+        self._removed.discard(node)
+        if self._left.pop(node, None) is not None:
+            self.run.nodes.gates.open(node)
 
     def _can_hold(self, target: Target) -> bool:
         is_here = not target.status.machine
@@ -207,10 +214,7 @@ class NodeRequests:
         try:
             await (hand.bring_back(target) if is_stopped(old) else hand.replace(target))
         except DoraSystemdError as error:
-            now = run.pump.cell.nodes[node]
-            if refused := refused_restart(node, old, now, error.message, now_us()):
-                run.pump.push(refused)
-            self._role.tell_refused(old.machine, node, error.message)
+            self._take_back(run, target, error.message)
             raise
         return f"Node restarting: {node}"
 
@@ -223,13 +227,24 @@ class NodeRequests:
         if old.state != "waiting":
             _require_running(cell)
         await self._tell(run, target, life.NodeAsked(now_us(), node, STOP, by))
-        await self._hand_of(run).stop(target)
+        try:
+            await self._hand_of(run).stop(target)
+        except DoraSystemdError as error:
+            self._take_back(run, target, error.message)
+            raise
         return f"Node stopping: {node}"
 
     async def _tell(self, run: Run, target: Target, event: life.NodeAsked) -> None:
         """Record a request, on the machine of the node too, before the request is carried out."""
         run.pump.push(event)
         await self._role.tell_asked(target.status.machine, event)
+
+    def _take_back(self, run: Run, target: Target, reason: str) -> None:
+        """Take back what _tell() has recorded, because dora refuses it."""
+        node, old = target.node, target.status
+        for event in refused_request(node, old, run.pump.cell.nodes[node], reason, now_us()):
+            run.pump.push(event)
+        self._role.tell_refused(old.machine, node, reason)
 
 
 def _has_ended(node: NodeStatus) -> bool:

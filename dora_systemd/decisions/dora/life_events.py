@@ -1,10 +1,11 @@
 """Lines that dora's coordinator and daemon print become life events. Pure."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import Exit
-from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.cell.status import NodeStatus, is_stopped
 from dora_systemd.decisions.dora.protocol import NO_NODE, LogRecord, exit_value
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.resources.oom import Oom
@@ -66,21 +67,33 @@ def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
     return life.NodeHung(at_us, match[1], match[2]) if match else None
 
 
-def refused_restart(
+def refused_request(
     node: str, before: NodeStatus, now: NodeStatus, reason: str, at_us: int
-) -> life.Event | None:
-    """The event of a requested restart that dora refuses; None if the next process runs anyway.
+) -> Sequence[life.Event]:
+    """The events of a requested restart or stop that dora refuses; none if a new process runs.
 
-    before: the request. Dora also refuses the restart of a node that has failed by itself just
+    before: the request. Dora also refuses a request for a node that has failed by itself just
     before: then its exit is the cause, which can also be received later.
     """
+    if is_stopped(now):
+        return _refused_stop(node, before, now, at_us)
     if now.state == "reloading" and before.may_run:
-        return life.NodeKept(at_us, node, before)
+        return [life.NodeKept(at_us, node, before)]
     if now.pid:
-        return None
+        return []
     is_cause = NO_NODE in reason and now.exit.is_failure
     how = now.exit if is_cause else Exit(words=reason.removeprefix("cannot do that in "))
-    return life.NodeExited(at_us, node, how, will_restart=False)
+    return [life.NodeExited(at_us, node, how, will_restart=False)]
+
+
+def _refused_stop(
+    node: str, before: NodeStatus, now: NodeStatus, at_us: int
+) -> Sequence[life.Event]:
+    """The events by which a node is as before the request, or has ended by itself."""
+    kept = life.NodeKept(at_us, node, before._replace(pid=now.pid))
+    if now.exit.is_failure or (before.pid and not now.pid):
+        return [kept, life.NodeExited(at_us, node, now.exit, will_restart=False)]
+    return [kept]
 
 
 def with_facts(

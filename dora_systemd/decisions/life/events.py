@@ -223,7 +223,7 @@ class NodeAsked(Event):
 
 @dataclass(frozen=True)
 class NodeKept(Event):
-    """Dora refuses a requested restart of the node, whose process continues, or has just failed."""
+    """Dora refuses a request for the node, whose process continues, or has just ended by itself."""
 
     node: str
     status: NodeStatus  # before the request

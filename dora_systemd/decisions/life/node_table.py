@@ -135,9 +135,9 @@ def _told_to_end(
 
 
 def _kept(nodes: NodeTable, event: life.NodeKept) -> NodeTable:
-    """Forget a requested restart of a process that has not ended: its end is not requested now."""
+    """Forget a request for a process that has not ended: its end is not requested now."""
     old = nodes.get(event.node, NodeStatus())
-    is_same = was_asked(old) and not is_stopped(old) and old.pid == event.status.pid
+    is_same = was_asked(old) and old.pid == event.status.pid
     return {**nodes, event.node: event.status} if is_same else nodes
 
 

@@ -181,7 +181,7 @@ class Asked:
     """Head to member: a restart or stop of one of the member's nodes was requested, or refused."""
 
     node: str
-    what: str  # RESTART or STOP, or "" if dora has refused the restart
+    what: str  # RESTART or STOP, or "" if dora has refused that
     by: str  # who requested that, or why dora has refused it
 
 

@@ -109,7 +109,7 @@ class Alone:
         """Notify the node's machine of a requested restart or stop, before that is carried out."""
 
     def tell_refused(self, machine: str, node: str, reason: str) -> None:
-        """Notify the node's machine that dora has refused the requested restart."""
+        """Notify the node's machine that dora has refused the requested restart or stop."""
 
     def cell(self, cell: Cell) -> Cell:
         """Return the cell at the beginning of a run."""

@@ -158,7 +158,7 @@ class Head(Shared):
                         await asyncio.sleep(_AGAIN_SECONDS)
 
     def tell_refused(self, machine: str, node: str, reason: str) -> None:
-        """Notify a member: else the member records the next crash as the end of a restart."""
+        """Notify a member: else the member records the next crash as a requested end."""
         if machine:
             self.roster.tell(wire.Asked(node, "", reason), machine)
 

@@ -23,7 +23,7 @@ from dora_systemd.adapters.runner_socket.listener import Ends, taken_over
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import RESTART, STOP, CellStatus, NodeStatus
-from dora_systemd.decisions.dora.life_events import refused_restart
+from dora_systemd.decisions.dora.life_events import refused_request
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.machines import wire
@@ -247,7 +247,7 @@ class Member(Shared):
             self._end_by_head("the head has lost another machine")
 
     def _note_asked(self, message: wire.Asked) -> None:
-        """Record a request for a node, or that dora has refused its restart."""
+        """Record a request for a node, or that dora has refused that."""
         node, nodes = message.node, self._pump.cell.nodes if self._pump else {}
         if node not in nodes:
             return
@@ -256,8 +256,8 @@ class Member(Shared):
             self._push(life.NodeAsked(now_us(), node, message.what, message.by))
         elif not message.what and (before := self._before.pop(node, None)):
             reason = short_line(message.by, _LONGEST)
-            if refused := refused_restart(node, before, nodes[node], reason, now_us()):
-                self._push(refused)
+            for event in refused_request(node, before, nodes[node], reason, now_us()):
+                self._push(event)
 
     def _stop_in_order(self, message: wire.Stopping | wire.StopNode) -> None:
         """Stop all nodes, or the one whose turn it is."""

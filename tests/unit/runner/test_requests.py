@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.dora.preparation import prepare
-from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -186,6 +186,50 @@ def test_a_node_that_dora_does_not_replace_runs_on(tmp_path: Path) -> None:
     assert bench.status("a") == NEVER
     ((_, node, reason),) = bench.role.refused
     assert (node, reason) == ("a", "cannot do that in dora: replacement adds input `i`")
+
+
+AFAR = RUNNING._replace(pid=0, machine="gpu")
+
+
+@pytest.mark.parametrize("before", [RUNNING, AFAR, BACKOFF, SPENT], ids=str)
+@pytest.mark.parametrize("node", ["a", "c"])
+def test_a_stop_that_dora_refuses_is_taken_back(
+    tmp_path: Path, node: str, before: NodeStatus
+) -> None:
+    """Else a node that runs is shown as stopped, and a crash of it counts as the requested end."""
+    is_held = node == "a" and not before.machine
+
+    async def scene(bench: AskedBench) -> None:
+        methods = ("RestartNode", "ReplaceNode") if is_held else ("RemoveNode",)
+        bench.dora.refuses = dict.fromkeys(methods, "no connection for daemon gpu")
+        with pytest.raises(DoraSystemdError, match="cannot do that in dora: no connection"):
+            await bench.ask("stop", node)
+        assert bench.status(node) == before
+        assert bench.gates.is_passing(node) is is_held, "dora's next process has to start"
+        bench.dora.refuses = {}
+        assert await bench.ask("stop", node) == f"Node stopping: {node}"
+
+    bench = run(tmp_path, scene, **{node: before})
+    reason = "cannot do that in dora: no connection for daemon gpu"
+    assert bench.role.refused == [(before.machine, node, reason)]
+    assert bench.status(node).state == "stopped"
+
+
+@pytest.mark.parametrize("how", [exit_of(1), Exit()], ids=["failed", "finished"])
+def test_a_node_that_ends_by_itself_just_before_its_stop(tmp_path: Path, how: Exit) -> None:
+    async def scene(bench: AskedBench) -> None:
+        def follow(event: life.Event) -> None:
+            if isinstance(event, life.NodeAsked):
+                bench.pump.push(life.NodeExited(1, "c", how, False))
+
+        bench.pump.on_event = follow
+        bench.dora.refuses["RemoveNode"] = "node `c` not found in running dataflow"
+        with pytest.raises(DoraSystemdError, match="not found"):
+            await bench.ask("stop", "c")
+
+    after = run(tmp_path, scene).status("c")
+    assert (after.state, after.exit) == ("failed" if how.is_failure else "finished", how)
+    assert not after.asked
 
 
 @pytest.mark.parametrize(("is_job", "times"), [(True, 4), (False, 0)])

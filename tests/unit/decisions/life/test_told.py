@@ -234,6 +234,12 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
         RELOADS._replace(asked=RESTART, pid=0),
         (),
     ),
+    "a stop that dora refuses": (
+        STOPPED,
+        life.NodeKept(20, "a", RUNS),
+        RUNS,
+        (),
+    ),
     "the end that a reload needs": (
         RELOADS,
         exited(),

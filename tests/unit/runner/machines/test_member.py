@@ -239,6 +239,27 @@ def test_a_restart_that_dora_refuses_is_taken_back(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
+def test_a_stop_that_dora_refuses_is_taken_back(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other, before = await bench.head(), NodeStatus("running", 7)
+        stopped = before._replace(state="stopped", asked="stop", asked_by="root")
+        for now in (stopped, stopped._replace(pid=0, exit=Exit(words="x"))):
+            bench.be(nodes={"mid": before})
+            other.say(wire.Asked("mid", "stop", "root"))
+            await settle()
+            bench.be(nodes={"mid": now})
+            other.say(wire.Asked("mid", "", "cannot do that in dora: no connection"))
+            await settle()
+        asked = life.NodeAsked(0, "mid", "stop", "root")
+        assert bench.heard()[1:] == [
+            *(asked, life.NodeKept(0, "mid", before)),
+            *(asked, life.NodeKept(0, "mid", before._replace(pid=0))),
+            life.NodeExited(0, "mid", Exit(words="x"), will_restart=False),
+        ]
+
+    run(tmp_path, work)
+
+
 @pytest.mark.parametrize(("said", "seconds"), [(SECOND // 2, 0.5), (0, 0.0), (3600 * SECOND, 2.0)])
 def test_the_head_can_only_shorten_the_grace(said: int, seconds: float, tmp_path: Path) -> None:
     """Its nodes end with those here, and its grace duration began before."""
