@@ -57,6 +57,7 @@ class Settings:
     # in system scope, environment files that only others than root name
     lent: frozenset[str] = frozenset()
     passed: tuple[SettingText, ...] = ()  # on a member, from the head
+    flagged_nodes: Nodes = field(default_factory=dict)  # the values of single nodes from --node
 
     def __getitem__(self, setting: Setting[T]) -> T:
         return cast(T, self.values[setting.name])
@@ -98,14 +99,17 @@ def resolve_settings(
     passed = tuple(parse_setting(text) for text in texts_of(flags.get(SET) or ()))
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
+    flagged: dict[str, Any] = {}
     for setting in table:
+        of_flag = [*_from_flag(setting, flags)]
         given = [
             *_from_files(setting, reversed(documents)),
             *_from_variable(setting, environment),
-            *_from_flag(setting, flags),
+            *of_flag,
         ]
         sources[setting.name], values[setting.name] = _merged(setting, given)
-    return Settings(values, sources, table, passed=passed)
+        flagged[setting.name] = of_flag[0][1] if of_flag else {}
+    return Settings(values, sources, table, passed=passed, flagged_nodes=flagged.get(NODES, {}))
 
 
 def given_texts(
@@ -247,8 +251,8 @@ def _is_passed(setting: Setting[Any], settings: Settings) -> bool:
 
 def idle_warnings(settings: Settings) -> Iterator[str]:
     """A warning for each setting that has no effect without another one."""
-    for setting, needed in _idle(settings):
-        yield f"{setting.flags[0]} has no effect without {needed.flags[0]}"
+    for flag, _, needed in _idle(settings):
+        yield f"{flag} has no effect without {needed.flags[0]}"
 
 
 def require_effect(settings: Settings) -> None:
@@ -256,19 +260,25 @@ def require_effect(settings: Settings) -> None:
 
     A settings file may have the same key: it may be for more than one dataflow.
     """
-    for setting, needed in _idle(settings):
-        flag, others = setting.flags[0], needed.flags[0]
-        if flag in settings.source(setting).split(", "):
-            hint = f"add {others}, or write {setting.name} in a settings file"
-            raise usage_error(f"cannot use {flag} without {others}", hint)
+    flagged = {_flag_of(node, key) for node, own in settings.flagged_nodes.items() for key in own}
+    for flag, setting, needed in _idle(settings):
+        if flag in (*flagged, *settings.source(setting).split(", ")):
+            hint = f"add {needed.flags[0]}, or write {setting.name} in a settings file"
+            raise usage_error(f"cannot use {flag} without {needed.flags[0]}", hint)
 
 
-def _idle(settings: Settings) -> Iterator[tuple[Setting[Any], Setting[Any]]]:
-    """The settings that are given and have no effect without another one, and that one."""
+def _flag_of(node: str, key: str) -> str:
+    return f"--node {node}:{key}"
+
+
+def _idle(settings: Settings) -> Iterator[tuple[str, Setting[Any], Setting[Any]]]:
+    """The flags of settings that are given and have no effect without another one, and both."""
     policies = {settings[RESTART_POLICY], *settings.by_node(RESTART_POLICY).values()}
     owes = settings.by_node(OWES).values()
     policies |= {"on-failure" for one in owes for owed in one if owed.then == RESTART}
     idle: list[tuple[Setting[Any], Setting[Any]]]
     idle = [(one, RESTART_POLICY) for one in POLICY_SETTINGS[1:] if policies == {"no"}]
     idle += [(one, HOT_RELOAD) for one in (WATCH, IGNORE) if not settings[HOT_RELOAD]]
-    return ((one, needed) for one, needed in idle if settings.is_given(one))
+    yield from ((one.flags[0], one, needed) for one, needed in idle if settings.is_given(one))
+    watched = () if settings[HOT_RELOAD] else settings.by_node(WATCH)
+    yield from ((_flag_of(node, WATCH.name), WATCH, HOT_RELOAD) for node in watched)

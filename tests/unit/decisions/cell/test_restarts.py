@@ -93,6 +93,10 @@ def test_warnings() -> None:
         "--ignore has no effect without --hot-reload",
     ]
     assert not list(idle_warnings(settings({**given, "hot_reload": True})))
+    nodes = {"nodes": {"camera": {"watch": "*.bin"}}}
+    warning = "--node camera:watch has no effect without --hot-reload"
+    assert list(idle_warnings(settings({"nodes": ["b:nice=3"]}, nodes))) == [warning]
+    assert not list(idle_warnings(settings({"hot_reload": True}, nodes)))
 
 
 @pytest.mark.parametrize(
@@ -113,6 +117,16 @@ def test_a_flag_without_effect_is_refused(flags: dict[str, object], message: str
     with pytest.raises(DoraSystemdError, match=message) as caught:
         require_effect(settings(flags))
     assert caught.value.code is ExitCode.USAGE
+
+
+def test_a_flag_for_one_node_without_effect_is_refused() -> None:
+    flags: dict[str, object] = {"nodes": ["a:watch=*.py"]}
+    with pytest.raises(DoraSystemdError, match="cannot use --node a:watch without") as caught:
+        require_effect(settings(flags))
+    assert caught.value.hint == "add --hot-reload, or write watch in a settings file"
+    require_effect(settings({**flags, "hot_reload": True}))
+    document = {"nodes": {"b": {"watch": "*.py"}}}
+    require_effect(settings({"nodes": ["a:memory_limit=1G"]}, document))
 
 
 @pytest.mark.parametrize(
