@@ -3,7 +3,7 @@
 A value is from flags, variables, settings files, or the default.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import PurePath
@@ -255,14 +255,17 @@ def idle_warnings(settings: Settings) -> Iterator[str]:
         yield f"{flag} has no effect without {needed.flags[0]}"
 
 
-def require_effect(settings: Settings) -> None:
+def require_effect(settings: Settings, flags: Container[str]) -> None:
     """Raise DoraSystemdError (USAGE) for a flag that has no effect without another setting.
 
-    A settings file may have the same key: it may be for more than one dataflow.
+    flags: the names of those that count. A settings file may have the same key: it may be for more
+    than one dataflow.
     """
-    flagged = {_flag_of(node, key) for node, own in settings.flagged_nodes.items() for key in own}
+    nodes = settings.flagged_nodes if NODES in flags else {}
+    flagged = {_flag_of(node, key) for node, own in nodes.items() for key in own}
     for flag, setting, needed in _idle(settings):
-        if flag in (*flagged, *settings.source(setting).split(", ")):
+        is_flag = setting.name in flags and flag in settings.source(setting).split(", ")
+        if is_flag or flag in flagged:
             hint = f"add {needed.flags[0]}, or write {setting.name} in a settings file"
             raise usage_error(f"cannot use {flag} without {needed.flags[0]}", hint)
 

@@ -66,8 +66,7 @@ def make_plan(scope: Scope, request: StartRequest, read: Files | None = None) ->
     """
     files = read or read_files(request)
     settings = settings_of(scope, files, request)
-    if not request.uuid:  # flags of a recorded start were accepted
-        require_effect(settings)
+    require_effect(settings, request.changed if request.uuid else request.flags)
     directory = working_directory(files, settings)
     user = choose_user(scope, settings[USER], files.place, directory)
     with sight_of(account_of(user)) as sight:

@@ -24,6 +24,8 @@ class StartRequest:
     environment: Mapping[str, str] = field(default_factory=dict)  # the caller's variables
     attached: bool = False  # the dataflow ends with the caller
     uuid: str = ""  # of a dataflow that is started again
+    # of `flags`, those that no earlier start has been accepted with, if there is a UUID
+    changed: frozenset[str] = frozenset()
     # of a release, the file that its dataflow file was copied from: who owns that decides, not
     # root, who owns the copy
     origin: Place | None = None

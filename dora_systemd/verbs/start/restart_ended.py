@@ -58,7 +58,8 @@ class Asked:
             raise usage_error(f"cannot start {self.name} as {quoted(wanted.name)}", hint)
         given = {key: value for key, value in wanted.flags.items() if is_given(value)}
         flags = {**self.flags, **given}
-        return replace(wanted, dataflow=self.dataflow, name=self.name, flags=flags, uuid=self.uuid)
+        known = replace(wanted, dataflow=self.dataflow, name=self.name, uuid=self.uuid)
+        return replace(known, flags=flags, changed=frozenset(given))
 
 
 def means_name(text: str) -> bool:

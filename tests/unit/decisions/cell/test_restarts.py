@@ -110,23 +110,24 @@ def test_warnings() -> None:
 )
 def test_a_flag_without_effect_is_refused(flags: dict[str, object], message: str) -> None:
     """A settings file may have the key."""
-    require_effect(settings({}, flags))
+    require_effect(settings({}, flags), flags)
     if not message:
-        require_effect(settings(flags))
+        require_effect(settings(flags), flags)
         return
     with pytest.raises(DoraSystemdError, match=message) as caught:
-        require_effect(settings(flags))
+        require_effect(settings(flags), flags)
     assert caught.value.code is ExitCode.USAGE
 
 
 def test_a_flag_for_one_node_without_effect_is_refused() -> None:
     flags: dict[str, object] = {"nodes": ["a:watch=*.py"]}
     with pytest.raises(DoraSystemdError, match="cannot use --node a:watch without") as caught:
-        require_effect(settings(flags))
+        require_effect(settings(flags), flags)
     assert caught.value.hint == "add --hot-reload, or write watch in a settings file"
-    require_effect(settings({**flags, "hot_reload": True}))
+    require_effect(settings(flags), {"hot_reload"})
+    require_effect(settings({**flags, "hot_reload": True}), flags)
     document = {"nodes": {"b": {"watch": "*.py"}}}
-    require_effect(settings({"nodes": ["a:memory_limit=1G"]}, document))
+    require_effect(settings({"nodes": ["a:memory_limit=1G"]}, document), flags)
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from dora_systemd.verbs.start.read import (
     read_settings_file,
 )
 from dora_systemd.verbs.start.request import StartRequest, current_directory, request_name
+from dora_systemd.verbs.start.restart_ended import Asked
 from dora_systemd.verbs.start.settings import check_config, require_modest, settings_of
 from dora_systemd.verbs.start.where import account_of, choose_user
 from tests.unit.fakes.programs import make_dora, make_program
@@ -95,12 +96,16 @@ def test_every_plan_has_a_uuid_of_its_own(project: Path) -> None:
 
 def test_a_flag_without_effect(project: Path) -> None:
     """A recorded start may have it: that of another version has accepted it."""
+    watching = {"watch": ("*.py",)}
     with pytest.raises(DoraSystemdError, match="cannot use --watch without --hot-reload"):
         plan_of(project, watch=("*.py",))
-    request = StartRequest(
-        str(project / "robot.yml"), None, {"watch": ("*.py",)}, {"PATH": f"{project}/bin"}
-    )
-    assert make_plan(USER, replace(request, uuid="u")).options.name == "robot"
+    asked = Asked("robot", "u", str(project / "robot.yml"), watching)
+    wanted = StartRequest("robot", environment={"PATH": f"{project}/bin"})
+    assert make_plan(USER, asked.request(wanted)).options.name == "robot"
+    with pytest.raises(DoraSystemdError, match="cannot use --watch without --hot-reload"):
+        make_plan(USER, replace(asked, flags={}).request(replace(wanted, flags=watching)))
+    again = replace(asked, flags={"hot_reload": True}).request(replace(wanted, flags=watching))
+    assert make_plan(USER, again).options.of_dataflow("watch") == ("*.py",)
 
 
 def test_interpreter(project: Path) -> None:
