@@ -79,8 +79,8 @@ def _shared(one: str, other: str) -> int:
 
 
 _OPTIONAL = (
-    *("PYTHON", "DORA", "FILES", "CREATED", "SIZE", "RELEASE", "BOOT", "PEAK", "PID"),
-    *("THROTTLED%", "RESTARTS"),
+    *("PYTHON", "DORA", "FILES", "CREATED", "SIZE", "EVENT", "WRITTEN"),
+    *("RELEASE", "BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS"),
     *("UPTIME", "WAITS FOR", "MEM", "CPU%", "WATCHDOG", "NODES", "UUID", "MACHINE"),
 )
 """Columns that a narrow terminal does without, in this order."""

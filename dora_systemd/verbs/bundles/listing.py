@@ -44,8 +44,9 @@ def find_name(manager: Manager, scope: Scope, selector: str) -> str:
 
 
 def read_bundles(scope: Scope, names: Sequence[str]) -> list[BundleRow]:
-    """Read the bundles of these dataflows, the newest of each first."""
-    return [_row(name, one) for name in names for one in reversed(store_of(scope, name).known())]
+    """Read the bundles of these dataflows, newest first."""
+    found = [(one.place, name, one) for name in names for one in store_of(scope, name).known()]
+    return [_row(name, one) for _, name, one in sorted(found, reverse=True)]
 
 
 def find_bundle(scope: Scope, name: str, ident: str) -> Stored | None:

@@ -107,6 +107,16 @@ def test_the_table() -> None:
     assert bundle_object(row._replace(manifest=replace(ONE, node="")))["node"] is None
 
 
+@pytest.mark.parametrize("width", [60, 80])
+def test_the_table_fits_a_narrow_terminal(width: int) -> None:
+    """The name of a bundle has its time and event, too."""
+    row = BundleRow("robot", "robot-20261128T030316Z-requested.tar", "/x", "requested", 2048, ONE)
+    title, line = format_bundles([row], width).splitlines()
+    assert title.split() == ["NAME", "BUNDLE", "WHY"]
+    assert row.id in line
+    assert len(line) <= width
+
+
 @pytest.mark.parametrize(
     ("manifest", "words"),
     [

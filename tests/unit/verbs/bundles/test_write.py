@@ -68,6 +68,12 @@ def test_a_bundle(reach: Reach, scope: ScopeIn, manager: FakeManager) -> None:
     (row,) = read_bundles(scope, ["robot"])
     assert row.manifest
     assert row.manifest.uuid == options().uuid
+    other = done.path.parent.parent / "zebra"
+    other.mkdir()
+    for stamp in ("20200101T000000Z", "20990101T000000Z"):
+        (other / f"zebra-{stamp}-requested.tar").touch()
+    of_all = [one.name for one in read_bundles(scope, ["robot", "zebra"])]
+    assert of_all == ["zebra", "robot", "zebra"], "newest first"
     assert list(remove_bundles(scope, "robot", [row.id])) == [row.id]
     assert read_bundles(scope, ["robot"]) == []
 
