@@ -323,9 +323,21 @@ def room(directory: Path) -> int:
     return left
 
 
+_PLACE_HINTS = {
+    errno.ENOENT: "create that directory first, or name a file in another one",
+    errno.ENOTDIR: "name a file in a directory",
+    errno.EISDIR: "name a file in it",
+}
+
+
+def place_hint(error: OSError) -> str:
+    """Return what to do about a place where no bundle can be written."""
+    return _PLACE_HINTS.get(error.errno or 0, "see df")
+
+
 def unusable(path: Path, error: OSError) -> DoraSystemdError:
     """The error for a store that cannot be used."""
     is_refused = isinstance(error, PermissionError)
-    hint = "use sudo, or -o FILE" if is_refused else "see df"
+    hint = "use sudo, or -o FILE" if is_refused else place_hint(error)
     code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
     return DoraSystemdError(f"cannot use {shown(str(path))}: {error.strerror}", hint, code)

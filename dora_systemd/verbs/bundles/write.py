@@ -23,6 +23,7 @@ from dora_systemd.adapters.bundles.store import (
     Sink,
     Stored,
     locked,
+    place_hint,
     room,
 )
 from dora_systemd.adapters.bus.manager import Manager
@@ -276,6 +277,6 @@ def _explained(path: Path) -> Iterator[None]:
         is_refused = isinstance(error, PermissionError)
         code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
         can_move = is_refused or error.errno == errno.EROFS
-        hint = "use sudo, or -o FILE in a directory of your own" if can_move else "see df"
+        hint = "use sudo, or -o FILE in a directory of your own" if can_move else place_hint(error)
         message = f"cannot write a bundle to {shown(str(path))}: {error.strerror}"
         raise DoraSystemdError(message, hint, code) from error

@@ -89,6 +89,10 @@ def test_another_place(reach: Reach, scope: ScopeIn, tmp_path: Path) -> None:
     with pytest.raises(DoraSystemdError, match="No such file") as caught:
         write_bundle(reach, scope, "robot", "x", tmp_path / "a/b.tar")
     assert caught.value.code is ExitCode.FAILURE
+    assert caught.value.hint.startswith("create that directory first")
+    with pytest.raises(DoraSystemdError, match="Is a directory") as caught:
+        write_bundle(reach, scope, "robot", "x", tmp_path)
+    assert caught.value.hint == "name a file in it"
 
 
 def test_an_unknown_one(reach: Reach, scope: ScopeIn) -> None:
