@@ -96,7 +96,7 @@ def command(
       doractl start dataflow.yml --memory-limit 4G --restart-policy on-failure
       doractl start robot                     a dataflow that has ended, again
       doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
-      doractl start dataflow.yml --node camera:cpu_limit=1.5 --max-restarts 3
+      doractl start dataflow.yml --node camera:restart_policy=always,max_restarts=3
       doractl start dataflow.yml --credential token=/etc/robot/token
       doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
       doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings

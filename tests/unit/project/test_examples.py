@@ -15,7 +15,9 @@ import pytest
 
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.cli.remote.dispatch import valued_options
+from dora_systemd.cli.setting_options import SettingsCommand
 from dora_systemd.decisions.remote.command_line import part_hosts
+from dora_systemd.decisions.settings.resolve import require_effect, resolve_settings
 from dora_systemd.errors import DoraSystemdError
 from tests.system.typed import command_of, typed_lines
 from tests.unit.checkout import CHECKOUT
@@ -74,6 +76,8 @@ def problem(arguments: Sequence[str], is_part: bool = False) -> str:
 def parse(command: click.Command, name: str, words: list[str], above: click.Context | None) -> None:
     """Parse a command line without running it."""
     context = command.make_context(name, words, parent=above)
+    if isinstance(command, SettingsCommand):
+        require_effect(resolve_settings(context.params, {}, ()), context.params)
     held = getattr(context, "_protected_args", None)  # click 8.1 has no underscore there
     held = context.protected_args if held is None else held
     if isinstance(command, click.Group) and (left := [*held, *context.args]):
