@@ -94,6 +94,9 @@ WORDS_OF_OTHERS = {
 }
 """Commands of docker, pm2, systemctl and dora, with the equivalent command of doractl."""
 
+_WHOLE = 1000
+"""Characters of a summary, which click cuts: more than any has."""
+
 _EPILOG = """\b
 Examples:
   doractl start dataflow.yml --name robot
@@ -151,6 +154,14 @@ class SubverbGroup(click.Group):
             return super().resolve_command(ctx, args)
         hint = _meant_verb(name, self.commands, group) or self.valid
         raise usage_error(f"unknown command {f'{group} {name}'!r}", hint)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the verbs with their whole summaries, which click would cut to a line."""
+        del ctx
+        every = sorted(self.commands.items())
+        rows = [(name, one.get_short_help_str(_WHOLE)) for name, one in every]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
 
 @click.group(

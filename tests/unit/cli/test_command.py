@@ -96,6 +96,20 @@ def test_the_usual_options_are_one_screen(
     assert int(count) == len(shown) + 1  # and -h
 
 
+@pytest.mark.parametrize("name", ["node", "machine"])
+def test_the_summaries_of_a_group_are_whole(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    assert main.run([name, "--help"]) == 0
+    shown = capsys.readouterr().out.partition("\nCommands:\n")[2].partition("\n\n")[0]
+    group = VERBS[name].command
+    assert isinstance(group, click.Group)
+    assert shown.startswith(f"  {min(group.commands)} ")
+    assert "..." not in shown
+    assert shown.endswith(".")
+
+
 def test_help_of_all_options_everywhere(capsys: pytest.CaptureFixture[str]) -> None:
     for verb in (["list"], ["node", "restart"]):
         assert main.run([*verb, "--help"]) == 0
