@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.errors import ExitCode
+from dora_systemd.verbs.facts.selector import OF_SYSTEM
 from tests.system.cells import Cell, Project, is_alive, run, wait_for
 from tests.system.terminal import shown
 
@@ -190,6 +191,10 @@ def test_a_user_has_dataflows_of_his_own(cell: Cell, project: Project) -> None:
         done = run("su", "bob", "-s", "/bin/sh", "-c", "exec doractl list")
         other = r"In system scope: \d+ \(doractl list --system\)"
         assert re.fullmatch(rf"No dataflow is running\.\n{other}\n", done.stdout), done.stdout
+        for verb in ("list", "why", "stop"):
+            words = f"exec doractl {verb} {cell.name}"
+            missing = run("su", "bob", "-s", "/bin/sh", "-c", words, check=False)
+            assert f"hint: {OF_SYSTEM}" in missing.stderr.splitlines(), missing.stderr
     finally:
         as_alice("stop", "--all")
 

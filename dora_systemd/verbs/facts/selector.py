@@ -4,17 +4,20 @@ Every search for a dataflow that a user or a client names begins here, so that a
 same selectors and report the same errors. `list` without a name does not load this module.
 """
 
+import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, TypeVar
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup.groups import group_path, has_group
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import (
     MIN_PREFIX,
+    SLICE,
     UNIT_PREFIX,
     UNIT_SUFFIX,
     Named,
@@ -34,9 +37,21 @@ if TYPE_CHECKING:
 
 _SHOWN = 10
 _PATTERN = re.compile(r"[*?\[]")
+OF_SYSTEM = "a dataflow of that name runs in system scope: add --system, or use sudo"
 
 
 N = TypeVar("N", bound=Named)
+
+
+def runs_for_root(names: Iterable[str]) -> bool:
+    """Whether one of these runs in system scope, and the calling user is not root.
+
+    Reads no more than a directory of the cgroup tree, which every user may read.
+    """
+    units = [unit_name(one) for one in names if is_name(one)] if os.geteuid() else []
+    with suppress(DoraSystemdError):
+        return any(has_group(group_path(f"/{SLICE}/{one}")) for one in units)
+    return False
 
 
 @dataclass(frozen=True)
@@ -82,11 +97,18 @@ class Selector:
             raise usage_error(f"{quoted(self.text)} is ambiguous", f"one of {candidates}")
         return found[0] if found else None
 
-    def missing(self, names: Iterable[str]) -> DoraSystemdError:
-        """The error (NOT_FOUND) if nothing matches. names: of the dataflows that are known."""
+    def missing(
+        self, names: Iterable[str], is_of_system: Callable[[Iterable[str]], bool] = runs_for_root
+    ) -> DoraSystemdError:
+        """The error (NOT_FOUND) if nothing matches. names: of the dataflows that are known.
+
+        is_of_system: whether a dataflow with one of these names runs in system scope.
+        """
         # A unit of that very name is not ours, and no hint.
         known = sorted({*names}.difference(self.names))
-        hint = did_you_mean(self.text, known)
+        is_there = is_of_system(self.names)
+        hint = OF_SYSTEM if is_there else ""
+        hint = hint or did_you_mean(self.text, known)
         if not hint and len(self.text) < MIN_PREFIX and is_uuid_prefix(self.text, 1):
             hint = f"the beginning of a UUID must have at least {MIN_PREFIX} characters"
         if not hint and known:

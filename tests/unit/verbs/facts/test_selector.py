@@ -1,6 +1,6 @@
 """Which dataflow a text means, wherever it is looked for."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import product
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_row
-from dora_systemd.verbs.facts.selector import Selector, find_all
+from dora_systemd.verbs.facts.selector import OF_SYSTEM, Selector, find_all, runs_for_root
 from dora_systemd.verbs.gateway import read_variables
 from dora_systemd.verbs.top import Top
 from tests.unit.fakes.journal import FakeJournal, life_record
@@ -101,6 +101,21 @@ def test_a_foreign_unit_of_that_name_is_no_hint() -> None:
     known = ["robot", "vision"]
     assert Selector("vision").missing(known).hint == "known dataflows: robot"
     assert Selector("dora-robot.service").missing(known).hint == "known dataflows: vision"
+
+
+def test_what_runs_for_root_is_named_to_other_users() -> None:
+    """Without sudo a verb has no other way to find it."""
+    asked: list[str] = []
+
+    def is_of_system(names: Iterable[str]) -> bool:
+        asked.extend(names)
+        return True
+
+    error = Selector("dora-robot").missing(["robto"], is_of_system)
+    assert error.message == "no dataflow named 'dora-robot'"
+    assert error.hint == OF_SYSTEM
+    assert asked == ["dora-robot", "robot"]
+    assert not runs_for_root(["no-such-dataflow", "/", "x" * 300])
 
 
 @given(st.text())
