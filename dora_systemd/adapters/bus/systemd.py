@@ -140,7 +140,8 @@ class Bus:
         self._call(f"clean {unit}", "CleanUnit", ("s", unit), ("as", ["fdstore"]))
 
     def hold(self, unit: str) -> None:
-        self._call(f"hold {unit}", "RefUnit", ("s", unit))
+        # Before a start only, and no user knows what it is to hold a unit.
+        self._call(f"start {unit}", "RefUnit", ("s", unit))
 
     def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
         arguments = (("s", unit), ("b", runtime), _typed(properties))

@@ -168,6 +168,14 @@ def test_a_unit_that_is_gone_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None
         bus.Bus(SYSTEM).run_jobs("StopUnit", ["gone"])
 
 
+def test_a_refused_hold_is_a_refused_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    systemd = fake_systemd(monkeypatch, FakeManager())
+    systemd.refused["RefUnit"] = DBusBaseError("org.freedesktop.systemd1.AccessDenied")
+    with pytest.raises(DoraSystemdError) as caught:
+        bus.Bus(SYSTEM).hold("dora-robot.service")
+    assert caught.value.message == "cannot start dora-robot.service: permission denied"
+
+
 @pytest.mark.parametrize("state", ["running", "frozen"])
 def test_nothing_frozen_is_stopped_or_killed(state: str, monkeypatch: pytest.MonkeyPatch) -> None:
     manager = FakeManager()
