@@ -88,7 +88,8 @@ def switch_record(
         undo.pop_all()
     if has_recorder or record is None:
         return ()
-    return (f"{cell.name} was started without record: restart it",)
+    restart = f"doractl restart {cell.name}"
+    return (f"{cell.name} was started without record, and records from its restart on: {restart}",)
 
 
 def remember(unit: Mapping[str, Any], changes: Iterable[SettingText], undo: ExitStack) -> None:

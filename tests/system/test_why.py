@@ -226,6 +226,8 @@ def test_unknown_and_in_a_pipe(cell: Cell, project: Project) -> None:
     done = cell.doractl("why", "x" + cell.name, check=False)
     assert done.returncode == ExitCode.NOT_FOUND
     assert done.stderr.startswith("doractl: no dataflow named ")
+    unset = cell.doractl("why", "", check=False)
+    assert unset.stderr.startswith("doractl: no dataflow named ''"), "and not what failed last"
     cell.start(project.three_nodes())
     command = f"doractl why {cell.name} | head -1"
     assert run("sh", "-c", command).stdout == f"{cell.name}: Running\n"

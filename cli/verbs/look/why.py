@@ -34,11 +34,12 @@ def command(selector: str | None, file: str | None, output: str) -> int:
       doractl why --bundle FILE     the report in a bundle, on any machine
     """
     if file is not None:
-        return _print_bundle(selector, Path(file).absolute(), output)
+        return _print_bundle(selector, file, output)
     scope = current_scope()
     check_readable(scope)
     bus = Bus(scope, for_reading=True)
-    report = explain_now(bus, scope, selector or newest_failure(bus, scope), JournalReader())
+    subject = newest_failure(bus, scope) if selector is None else selector
+    report = explain_now(bus, scope, subject, JournalReader())
     if output == "json":
         print_json(report_object(report, subject_row(bus, scope, report.subject)))
         return ExitCode.OK
@@ -46,13 +47,16 @@ def command(selector: str | None, file: str | None, output: str) -> int:
     return ExitCode.OK
 
 
-def _print_bundle(selector: str | None, path: Path, output: str) -> int:
+def _print_bundle(selector: str | None, file: str, output: str) -> int:
     """Print the report in a bundle, which may be of another machine, or forged."""
     # Imported late: most explain what this machine knows.
     from dora_systemd.verbs.bundles.listing import parse_why, read_report, shown_readme
 
     if selector is not None:
         raise usage_error("cannot use both a SELECTOR and --bundle", "doractl why --bundle FILE")
+    if not file:  # not the working directory: a variable of a script is not set
+        raise usage_error("cannot read '': no path", "doractl why --bundle FILE")
+    path = Path(file).absolute()
     readme, why = read_report(path)
     if output == "json":
         click.echo(json.dumps(parse_why(why, path), indent=2))

@@ -155,6 +155,7 @@ def test_every_option_says_what_it_does(name: str) -> None:
             "unknown option --memroy-limit",
             "did you mean --memory-limit?",
         ),
+        (["why", "--bundle", ""], "cannot read '': no path", "doractl why --bundle FILE"),
         (["stop"], "cannot stop: give names or --all", "doractl stop NAME, or doractl stop --all"),
         (["stop", "x", "--all"], "cannot stop: give names or --all", ""),
         (["show"], "missing argument", "see doractl show --help"),

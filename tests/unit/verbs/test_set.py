@@ -135,7 +135,8 @@ def test_a_recorder_that_was_not_started_needs_a_restart(
     place: Place, text: str, warns: bool
 ) -> None:
     found = switch_record(place.manager, place.scope, place.cell, text, lambda *_: {})
-    expected = (f"{place.cell.name} was started without record: restart it",)
+    what = "was started without record, and records from its restart on"
+    expected = (f"{place.cell.name} {what}: doractl restart {place.cell.name}",)
     assert found == (expected if warns else ())
     assert "record=" in place.drop_in.read_text()
 
