@@ -168,7 +168,7 @@ def format_report(report: Report, width: int | None = None, want_colors: bool = 
         [_title(report, width, want_colors), *_wrapped(_facts(report), width, 2 + _TITLE_WIDTH)],
         _section("Where it crashed:", _cut(map(str, report.stack), width), want_colors),
         _section("What happened:", _cut(_timeline(report), width), want_colors),
-        _section(cut(_words_title(report), width), _cut(_words(report), width), want_colors),
+        _section(_words_title(report), _cut(_words(report), width), want_colors, width),
         _section("What to do:", _wrapped(remedies(report), width, 2), want_colors),
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
@@ -182,9 +182,14 @@ def _title(report: Report, width: int | None, want_colors: bool) -> str:
     return f"{name}: {status}"
 
 
-def _section(title: str, lines: list[str], want_colors: bool) -> list[str]:
-    heading = f"{_BOLD}{title}{_PLAIN}" if want_colors else title
-    return [heading, *lines] if lines else []
+def _section(
+    title: str, lines: list[str], want_colors: bool, width: int | None = None
+) -> list[str]:
+    """The lines below their title, which is wrapped: a command in it can be copied."""
+    if not lines:
+        return []
+    titles = [title] if width is None else wrapped(title, width, 2)
+    return [*(f"{_BOLD}{one}{_PLAIN}" if want_colors else one for one in titles), *lines]
 
 
 def _cut(lines: Iterable[str], width: int | None) -> list[str]:

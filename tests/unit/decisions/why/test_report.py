@@ -137,6 +137,13 @@ def test_the_status_is_whole_at_any_width(width: int | None, name: str, title: s
     assert len(first) == len(title) + len(": Failed")
 
 
+@pytest.mark.parametrize("want_colors", [False, True])
+def test_the_command_for_all_lines_is_whole_at_any_width(want_colors: bool) -> None:
+    lines = format_report(FULL, 50, want_colors).replace("\x1b[1m", "").replace("\x1b[0m", "")
+    heading = "The last 2 lines of camera (all: doractl logs\n  robot --node camera):\n"
+    assert heading in lines
+
+
 def facts(verdict: Verdict, **more: Any) -> dict[str, str]:
     """The lines below the title, by their first word."""
     report = replace(FULL, verdict=verdict, **more)
