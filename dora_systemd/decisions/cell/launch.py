@@ -5,7 +5,7 @@ as the daemon would. Nodes that dora must start itself stay unchanged.
 """
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import PurePath
@@ -16,7 +16,15 @@ from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import base_of, owes_of, policies_of
-from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS, restart_of
+from dora_systemd.decisions.cell.restarts import (
+    DEFAULT,
+    DORA_KEYS,
+    HELD_KEYS,
+    LATCH_KEYS,
+    RestartPolicy,
+    given_policies,
+    restart_of,
+)
 from dora_systemd.decisions.cell.uv import Read, find_lock, uv_project
 from dora_systemd.decisions.descriptor.dataflow import BuildSession, Dataflow, expanded
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind, operator_file, split_arguments
@@ -169,10 +177,11 @@ def _keys_of_kept(node: str, options: RunnerOptions) -> Mapping[str, Any]:
 
 def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
     """The restart keys of the node: from the settings for it, its own, or the dataflow's."""
-    if own := policies_of(options).get(node.id):
+    own, given = policies_of(options).get(node.id), given_policies(options).get(node.id, {})
+    if own and ("policy" in given or node.restart_policy in ("", "never")):
         return own.dora_keys()
     if node.restart_policy:
-        return _restart_bounds(node)
+        return _with_budget(_restart_bounds(node), own, given) if own else _restart_bounds(node)
     # dora does not restart nodes made of operators, nor dynamic nodes.
     is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
     policy = base_of(restart_of(options), owes_of(options), node.id)
@@ -181,6 +190,23 @@ def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
     # Without a policy of the dataflow it restarts by its owes alone.
     kept = node.backoff if restart_of(options).policy == "no" else {}
     return {**policy.dora_keys(), **{key: kept[key] for key in _BUDGET if key in kept}}
+
+
+def _with_budget(
+    bounds: Mapping[str, Any], own: RestartPolicy, given: Container[str]
+) -> dict[str, Any]:
+    """The keys of a node that keeps the policy in the descriptor, with the settings for it.
+
+    given: the fields of `own` that the settings have.
+    """
+    if not bounds:
+        return {}
+    keys = own._replace(policy="always").dora_keys()
+    of_settings = [key for field_, key in DORA_KEYS.items() if field_ in given]
+    found = {**bounds, **{key: keys.get(key) for key in of_settings}}
+    if "max_restarts" not in given:  # that of the descriptor may be large
+        found["restart_delay"] = max(found["restart_delay"], DEFAULT.delay / SECOND)
+    return {**found, "max_restart_delay": max(found["restart_delay"], found["max_restart_delay"])}
 
 
 def _restart_bounds(node: Node) -> dict[str, Any]:

@@ -217,6 +217,48 @@ def test_the_settings_of_a_node_win() -> None:
     assert node(given, DEFAULT, "n")["restart_policy"] == "never"
 
 
+@pytest.mark.parametrize(
+    ("raw", "given", "expected"),
+    [
+        (
+            {"restart_policy": "always", "max_restarts": 9, "restart_window": 5},
+            {"max_restarts": 3},
+            ("always", 3, 0.5, 30.0, 5),
+        ),
+        (
+            {"restart_policy": "on-failure", "max_restarts": 9},
+            {"restart_delay": "40s", "restart_window": "1min"},
+            ("on-failure", 9, 40.0, 40.0, 60.0),
+        ),
+        (
+            {"restart_policy": "on-failure", "max_restarts": 10**6},
+            {"restart_delay": 0, "restart_window": "infinity"},
+            ("on-failure", 10**6, 0.5, 30.0, None),
+        ),
+        (
+            {"restart_policy": "on-failure", "restart_delay": 60},
+            {"max_restart_delay": "1s"},
+            ("on-failure", None, 60.0, 60.0, None),
+        ),
+        ({"restart_policy": "never"}, {"max_restarts": 3}, ("never", None, None, None, None)),
+        (
+            {"restart_policy": "never", "outputs": ["image"]},
+            {"max_restarts": 3, "owes": OWES},
+            ("on-failure", 3, 0.5, 30.0, 600.0),
+        ),
+        ({}, {"max_restarts": 3}, ("never", None, None, None, None)),
+        ({"restart_policy": "always"}, {"restart_policy": "no"}, ("never", *[None] * 4)),
+    ],
+)
+def test_a_budget_alone_keeps_the_policy_in_the_dataflow_file(
+    raw: dict[str, Any], given: dict[str, object], expected: tuple[object, ...]
+) -> None:
+    flow = parse_dataflow({"nodes": [{"id": "n", "path": "a.py", **raw}]}, "flow.yml")
+    given_settings = runner(settings({}, {"nodes": {"n": given}})).settings
+    (launched,) = launch_descriptor(flow, plan(settings=given_settings))["nodes"]
+    assert tuple(map(launched.get, DORA)) == expected
+
+
 def test_endless() -> None:
     keys = POLICY._replace(max_restarts=INFINITY, window=INFINITY).dora_keys()
     assert keys["max_restarts"] == 0
