@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 import tarfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,7 +20,7 @@ from typing import BinaryIO, NamedTuple, Protocol
 
 from dora_systemd.decisions.bundles.manifest import Part
 from dora_systemd.decisions.views.rows import Bundles
-from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input, words_of
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import SECOND, as_mapping, format_rounded_size, shown
 
@@ -326,13 +327,27 @@ def room(directory: Path) -> int:
 _PLACE_HINTS = {
     errno.ENOENT: "create that directory first, or name a file in another one",
     errno.ENOTDIR: "name a file in a directory",
-    errno.EISDIR: "name a file in it",
 }
 
 
 def place_hint(error: OSError) -> str:
     """Return what to do about a place where no bundle can be written."""
     return _PLACE_HINTS.get(error.errno or 0, "see df")
+
+
+def require_replaceable(path: Path) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) unless a bundle may take the place of what is at `path`.
+
+    A bundle is renamed to its path: root would replace /dev/null or /dev/stdout by a file, and
+    nothing that needs the device would work any more.
+    """
+    with suppress(OSError):  # there is nothing, or the write fails
+        mode = path.lstat().st_mode
+        if not stat.S_ISREG(mode):
+            is_directory = stat.S_ISDIR(mode)
+            reason = "it is a directory" if is_directory else "it is not a regular file"
+            hint = "name a file in it" if is_directory else "name another file"
+            raise bad_input(f"cannot write a bundle to {shown(str(path))}: {reason}", hint)
 
 
 def unusable(path: Path, error: OSError) -> DoraSystemdError:

@@ -24,6 +24,7 @@ from dora_systemd.adapters.bundles.store import (
     Stored,
     locked,
     place_hint,
+    require_replaceable,
     room,
 )
 from dora_systemd.adapters.bus.manager import Manager
@@ -97,6 +98,8 @@ def write_bundle(
 
     reach: opens the connection to systemd. command: that requests it, such as "doractl bundle".
     """
+    if file is not None:
+        require_replaceable(file)
     what = _evidence(reach, scope, selector, want_journal, want_pictures)
     subject = what.report.subject
     manifest = _manifest(what, requester(command))

@@ -1,5 +1,6 @@
 """`doractl bundle` of a dataflow that only the journal knows, and what is printed of it."""
 
+import os
 import time
 from collections.abc import Callable
 from functools import partial
@@ -90,9 +91,26 @@ def test_another_place(reach: Reach, scope: ScopeIn, tmp_path: Path) -> None:
         write_bundle(reach, scope, "robot", "x", tmp_path / "a/b.tar")
     assert caught.value.code is ExitCode.FAILURE
     assert caught.value.hint.startswith("create that directory first")
-    with pytest.raises(DoraSystemdError, match="Is a directory") as caught:
+    with pytest.raises(DoraSystemdError, match="it is a directory") as caught:
         write_bundle(reach, scope, "robot", "x", tmp_path)
     assert caught.value.hint == "name a file in it"
+
+
+def test_what_is_no_regular_file_is_not_replaced(
+    reach: Reach, scope: ScopeIn, tmp_path: Path
+) -> None:
+    """Root would replace /dev/null, and /dev/stdout is a link."""
+    (link := tmp_path / "link.tar").symlink_to(tmp_path / "other.tar")
+    os.mkfifo(fifo := tmp_path / "fifo.tar")
+    for place in (link, fifo):
+        with pytest.raises(DoraSystemdError, match=r"tar: it is not a regular file$") as caught:
+            write_bundle(reach, scope, "robot", "x", place)
+        assert (caught.value.hint, caught.value.code) == ("name another file", ExitCode.BAD_INPUT)
+    assert link.is_symlink() and fifo.is_fifo() and not (tmp_path / "other.tar").exists()
+    (old := tmp_path / "old.tar").write_text("of yesterday")
+    assert write_bundle(reach, scope, "robot", "x", old).path == old
+    with opened(old) as bundle:
+        bundle.check()
 
 
 def test_an_unknown_one(reach: Reach, scope: ScopeIn) -> None:
