@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import takewhile
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
@@ -276,7 +277,9 @@ def words_of_start(manager: Manager, scope: Scope, uuid: str) -> list[str]:
         report = explain(manager, scope, uuid, journal)
         words = report.words
         if not words:
+            began = report.verdict.began_us  # what was written before is of another start
             records = journal.newest(_own_matches(scope, report.subject), None)
-            words = choose_last(records, WORDS_OF_START)
+            own = takewhile(lambda one: int(one["__REALTIME_TIMESTAMP"]) >= began, records)
+            words = choose_last(own, WORDS_OF_START)
         return [f"{one.node}: {one.text}" for one in shown_last(words, WORDS_OF_START)]
     return []

@@ -42,13 +42,14 @@ EVENTS = [
         DORA_NODES="camera detector", DORA_REASON="node camera: exit code 3",
     ),
 ]  # fmt: skip
+BEFORE = record(0, "detector", "of the start before", DORA_STREAM="stderr")
 CAMERA = [record(2, "camera", "no camera there", DORA_STREAM="stderr")]
 DETECTOR = [record(n, "detector", f"frame {n}", DORA_STREAM="stderr") for n in range(4, 8)]
 
 
 def play(patch: pytest.MonkeyPatch, place: Path, camera: list[dict[str, Any]]) -> None:
     """A journalctl that answers with events, the camera's lines, or those of all nodes."""
-    answers = {"events": EVENTS, "camera": camera, "all": [*camera, *DETECTOR]}
+    answers = {"events": EVENTS, "camera": camera, "all": [BEFORE, *camera, *DETECTOR]}
     for name, records in answers.items():
         lines = [f"{json.dumps(one)}\n" for one in reversed(records)]
         (place / name).write_text("".join(lines))
@@ -75,7 +76,7 @@ def test_a_failed_start_ends_with_the_words_of_the_guilty_node(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    """Those of the others only if it has written nothing."""
+    """Those of the others only if it has written nothing, and never those of an earlier start."""
     manager.add(options(), ActiveState="failed", SubState="failed")
     play(monkeypatch, tmp_path, camera)
     assert words_of_start(manager, scope, UUID) == words
