@@ -20,7 +20,7 @@ from dora_systemd.scope import scope_of
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.logs import FollowedLog, Write
 from dora_systemd.verbs.start.plan import Plan
-from dora_systemd.verbs.start.run import SIGNALS, follow_unit
+from dora_systemd.verbs.start.run import SIGNALS, follow_unit, require_executed
 from dora_systemd.verbs.start.start_unit import start_unit
 
 if TYPE_CHECKING:
@@ -76,7 +76,9 @@ def print_until_end(
             if not isinstance(logs, FollowedLog):
                 logs.others = _members(bus, plan, since, warn)
             by = partial(note_request, "stop-asked", options.name, options.uuid, how.command)
-            return follow_unit(bus, plan.unit, logs, stage, how.signals, how.stop_after, by)
+            status = follow_unit(bus, plan.unit, logs, stage, how.signals, how.stop_after, by)
+    require_executed(plan.scope, options.name, status)
+    return status
 
 
 def _shared(head: FollowedLog, write: Write, form: Callable[[Record], bytes]) -> "SharedLog":

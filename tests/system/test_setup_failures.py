@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.decisions.life.refusal import setup_failure
+from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 from tests.system.test_list_questions import check_truth, is_running
 
@@ -85,6 +86,19 @@ def test_a_failure_of_another_dataflow_of_that_name(cell: Cell, project: Project
     sync_journal()
     rows = json.loads(cell.doractl("list", "--all", "-o", "json").stdout)
     assert [one["status"] for one in rows if one["name"] == cell.name] == ["Stopped"]
+
+
+@pytest.mark.warns("Failed", "status=226", "No such file", "exited")
+@pytest.mark.parametrize("verb", ["run", "start"])
+def test_a_terminal_that_waits_for_lines(cell: Cell, project: Project, verb: str) -> None:
+    """The runner, which has never begun, cannot say it."""
+    _, words = binds(project)
+    attached = ("--attach",) if verb == "start" else ()
+    flow = str(project.three_nodes())
+    done = cell.doractl(verb, flow, "--name", cell.name, *words, *attached, check=False)
+    assert done.returncode == ExitCode.FAILURE
+    assert f"doractl: cannot start {cell.name}: {SANDBOX}\n" in done.stderr
+    assert done.stdout == ""
 
 
 @pytest.mark.warns("Failed", "status=226", "No such file", "exited")

@@ -16,8 +16,12 @@ from dora_systemd.adapters.bus.manager import (
     is_at_rest,
     tell_stage,
 )
+from dora_systemd.decisions.life.refusal import setup_failure
 from dora_systemd.decisions.life.runner_exit import RunnerExit
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.verbs.facts.reason import logs_hint
 
 HELD: Property = ("AddRef", "b", True)
 """Keeps an ended unit, and its result, for this client; for a new unit what hold() is for others.
@@ -107,6 +111,16 @@ def follow_unit(
             if status is not None:
                 logs.finish()
                 return status
+
+
+def require_executed(scope: Scope, name: str, status: int) -> None:
+    """Raise DoraSystemdError if systemd could not execute the runner, which reports nothing then.
+
+    status: of follow_unit().
+    """
+    if reason := setup_failure(status):
+        message = f"cannot start {name}: {reason}"
+        raise DoraSystemdError(message, logs_hint(scope.flag, name, reason))
 
 
 class _Stop:

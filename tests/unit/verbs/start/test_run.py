@@ -10,9 +10,16 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.start import run
-from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
+from dora_systemd.verbs.start.run import (
+    attached_properties,
+    follow_unit,
+    life_line,
+    require_executed,
+)
 from tests.unit.fakes.manager import FakeManager, options
 
 UNIT = "dora-robot.service"
@@ -97,6 +104,16 @@ def test_exit_status(logs: Lines, states: list[dict[str, Any]], status: int) -> 
     assert follow_unit(Life(list(states)), UNIT, logs, stages.append) == status
     assert logs.is_finished
     assert set(stages) == {"1/1 nodes running"}
+
+
+def test_a_runner_that_systemd_could_not_execute() -> None:
+    scope = Scope(is_user=False, uid=0)
+    for status in (0, 1, 69, 137):
+        require_executed(scope, "robot", status)
+    with pytest.raises(DoraSystemdError) as caught:
+        require_executed(scope, "robot", 226)
+    assert caught.value.message.startswith("cannot start robot: its sandbox could not be set up")
+    assert caught.value.hint == "doractl --system why robot shows more"
 
 
 def test_first_ctrl_c_stops_and_second_kills(logs: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
