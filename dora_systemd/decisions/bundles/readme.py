@@ -1,9 +1,10 @@
 """README.txt, the first file of a bundle: what a person reads first. Pure."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 
 from dora_systemd.decisions.bundles.manifest import Manifest
-from dora_systemd.terminal_text import one_line
+from dora_systemd.terminal_text import cut, one_line, wrapped
 from dora_systemd.values import format_moment
 
 _FILES = (
@@ -34,6 +35,26 @@ _JOURNAL = (
     "  /usr/lib/systemd/systemd-journal-remote -o bundle.journal journal.export",
     "  journalctl --file bundle.journal",
 )
+
+
+_OF_LOG = re.compile(r"  (?:[0-9]{2}-[0-9]{2} )?[0-9]{2}:[0-9]{2}:[0-9]{2}  ")
+"""The beginning of an event, or of a line of a node: as in `why`, these are cut."""
+_LABEL = re.compile(r"  \S+: +|  \S+ {2,}|  ")
+
+
+def fitted(lines: Iterable[str], width: int) -> Iterator[str]:
+    """The lines of a README.txt for a terminal of that width: all but those of logs are wrapped.
+
+    The terminal wraps the commands: then they can be copied.
+    """
+    for line in lines:
+        label = _LABEL.match(line)
+        if line in _JOURNAL:
+            yield line
+        elif not line or _OF_LOG.match(line):
+            yield cut(line, width)
+        else:
+            yield from wrapped(line, width, min(label.end(), width // 2) if label else 0)
 
 
 def format_readme(manifest: Manifest, why: str, names: Sequence[str], want_journal: bool) -> str:

@@ -10,11 +10,12 @@ from dora_systemd.adapters.bundles.reader import chunks_of, opened
 from dora_systemd.adapters.bundles.store import BundleStore, Stored, unusable
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.bundles.manifest import README, WHY, no_bundle
+from dora_systemd.decisions.bundles.readme import fitted
 from dora_systemd.decisions.bundles.table import BundleRow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_name
 from dora_systemd.scope import Scope
-from dora_systemd.terminal_text import cut, one_line
+from dora_systemd.terminal_text import one_line
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import as_mapping
 from dora_systemd.verbs.facts.selector import Selector
@@ -95,4 +96,5 @@ def parse_why(data: bytes, path: Path) -> dict[str, Any]:
 
 def shown_readme(text: str, width: int | None = None) -> str:
     """README.txt for a terminal: no text in a bundle controls it."""
-    return "\n".join(cut(one_line(line), width) for line in text.rstrip("\n").split("\n"))
+    lines = [one_line(line) for line in text.rstrip("\n").split("\n")]
+    return "\n".join(lines if width is None else fitted(lines, width))

@@ -25,6 +25,33 @@ def test_no_text_of_a_bundle_controls_the_terminal(tmp_path: Path) -> None:
     assert json.dumps(parse_why(b"[]", tmp_path)) == "{}"
 
 
+def test_only_lines_of_logs_are_cut() -> None:
+    """What a bundle can contain must be read whole, and a command must be copied."""
+    text = (
+        "Bundle of dataflow robot on lab\n\n"
+        "  Before:   stopped by root (doractl restart) at noon\n"
+        "  11-28 03:51:10  Dataflow robot is running, all nodes are ready\n"
+        "  03:51:10  the line of a node is as long as it wants\n"
+        "  why.json      the report above, for programs\n"
+        "  /usr/lib/systemd/systemd-journal-remote -o bundle.journal journal.export\n"
+        "Never in a bundle: values of environment variables\n"
+    )
+    assert shown_readme(text, None) == text.rstrip("\n")
+    assert shown_readme(text, 40).split("\n") == [
+        "Bundle of dataflow robot on lab",
+        "",
+        "  Before:   stopped by root (doractl",
+        "            restart) at noon",
+        "  11-28 03:51:10  Dataflow robot is run…",
+        "  03:51:10  the line of a node is as lo…",
+        "  why.json      the report above, for",
+        "                programs",
+        "  /usr/lib/systemd/systemd-journal-remote -o bundle.journal journal.export",
+        "Never in a bundle: values of environment",
+        "variables",
+    ]
+
+
 def test_a_dataflow_is_known_by_its_bundles(scope: ScopeIn, manager: FakeManager) -> None:
     assert kept_names(scope) == []
     (scope.state_root / "dora-systemd/bundles/robot").mkdir(parents=True)
