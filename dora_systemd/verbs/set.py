@@ -20,6 +20,7 @@ from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, check_nodes, 
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.settings.limit_checks import (
+    Used,
     check_cpus,
     check_kept,
     check_use,
@@ -51,7 +52,7 @@ def set_limits(
 ) -> tuple[str, ...]:
     """Change limits of a dataflow, or of its next start if it does not run; return warnings.
 
-    flags: raw values by name of CHANGEABLE. is_forced: also memory limits below the current
+    flags: raw values by name of CHANGEABLE. is_forced: also limits below the current
     usage. `ask`: sends a request to the runner. Raises DoraSystemdError; then nothing is changed.
     """
     settings = resolve_settings(flags, {}, (), CHANGEABLE)
@@ -70,7 +71,7 @@ def set_limits(
     unit = manager.read(cell.unit, _PROPERTIES)
     values = {key: settings.values[key] for key in BY_KEY}
     warnings = (*size_warnings(values, nodes, read_machine()), *_placed_warnings(cell, rates))
-    _check_memory(unit, values, nodes, is_forced)
+    _check_usage(unit, values, nodes, is_forced)
     # systemd stores drop-ins of a transient unit in /run in any case.
     is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
     # The kernel is the most likely to refuse, then systemd. `undo` reverts the steps before that.
@@ -88,16 +89,17 @@ def set_limits(
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
 
 
-def _check_memory(
+def _check_usage(
     unit: Mapping[str, Any], values: Mapping[str, Any], nodes: Sequence[NodeLimits], is_forced: bool
 ) -> None:
-    """Raise DoraSystemdError for a memory limit below what is used, or below what is kept."""
+    """Raise DoraSystemdError for a limit below what is used, or of memory below what is kept."""
     if not unit["ControlGroup"]:
         return
     group = cgroup.group_path(unit["ControlGroup"])
     kept = cgroup.read_numbers(group / "memory.stat").get("shmem", 0)
     if not is_forced:
-        check_use(values, nodes, cgroup.read_usage(group).memory, _held(group))
+        held = {node: _used(one) for node, one in cgroup.node_groups(group).items()}
+        check_use(values, nodes, _used(group), held)
     check_kept(values["memory_limit"], kept)
 
 
@@ -153,9 +155,10 @@ def _check_nodes(
     check_nodes(limits, kinds, [node for node, kind in kinds.items() if kind == "dynamic"])
 
 
-def _held(group: Path) -> dict[str, int | None]:
-    """The memory of each node in bytes."""
-    return {node: cgroup.read_usage(one).memory for node, one in cgroup.node_groups(group).items()}
+def _used(group: Path) -> Used:
+    """The memory and the tasks of a group."""
+    tasks, _ = cgroup.read_tasks(group)
+    return {"memory_limit": cgroup.read_usage(group).memory, "tasks_limit": tasks}
 
 
 def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:

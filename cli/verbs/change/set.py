@@ -35,7 +35,7 @@ from dora_systemd.verbs.set import set_limits
     metavar="last=TIME,memory=SIZE,...",
     help="What the recorder keeps from now on; off gives its memory back.",
 )
-@click.option("--force", is_flag=True, help="Set a memory limit below the current usage, too.")
+@click.option("--force", is_flag=True, help="Set a limit below the current usage, too.")
 @acting_options
 def command(
     selector: str, hot_reload: str | None, record: str | None, force: bool, **flags: Any

@@ -26,6 +26,13 @@ _CONTROLLERS = {
 """Keys of a unit that need a controller, see systemd.resource-control(5)."""
 
 _MEMORY = "memory_limit"
+_USES = {
+    _MEMORY: ("memory", "uses", "the kernel may kill processes then"),
+    "tasks_limit": ("tasks", "has", "no process and no thread can start then"),
+}
+"""What is limited by key, how its use is reported, and what follows from a limit below that."""
+Used = Mapping[str, int | None]
+"""The memory in bytes and the number of tasks that are in use, by the key of their limit."""
 _MEGABYTE = 1024 * 1024
 _STOP_POST_BYTES = 12 * _MEGABYTE
 """What ExecStopPost= of a dataflow takes."""
@@ -78,7 +85,9 @@ def check_controllers(needed: Mapping[str, str], available: Collection[str], is_
     """
     for controller, what in needed.items():
         if controller not in available:
-            hint = "as root: systemctl edit user@.service, [Service] Delegate=cpu memory pids io"
+            more = "cpuset " if controller == "cpuset" else ""
+            delegated = f"Delegate=cpu {more}memory pids io"
+            hint = f"as root: systemctl edit user@.service, [Service] {delegated}"
             raise DoraSystemdError(
                 f"cannot enforce {what}: systemd has no {controller!r} cgroup controller",
                 hint if is_user else "the kernel or the container does not provide it",
@@ -109,22 +118,24 @@ def size_warnings(
 def check_use(
     limits: Mapping[str, int | None],
     nodes: Iterable[NodeLimits],
-    whole: int | None,
-    held: Mapping[str, int | None],
+    whole: Used,
+    held: Mapping[str, Used],
 ) -> None:
-    """Raise DoraSystemdError for the first memory limit below the current usage.
+    """Raise DoraSystemdError for the first limit of memory or tasks below the current usage.
 
-    limits: of the dataflow, by key. whole, held: bytes in use by it and by each node.
+    limits: of the dataflow, by key. whole, held: what it uses, and what each node uses.
     """
-    pairs = [("the dataflow", limits.get(_MEMORY), whole)]
-    pairs += [(f"the node {n.node}", dict(n.limits).get(_MEMORY), held.get(n.node)) for n in nodes]
-    for whose, limit, used in pairs:
-        if limit is not None and used is not None and limit < used:
-            raise DoraSystemdError(
-                f"cannot limit the memory of {whose} to {_shown(_MEMORY, limit)}: "
-                f"it uses {_shown(_MEMORY, used)} now",
-                "--force does it; the kernel may kill processes then",
-            )
+    every = [("the dataflow", limits, whole)]
+    every += [(f"the node {n.node}", dict(n.limits), held.get(n.node, {})) for n in nodes]
+    for whose, own, used in every:
+        for key, (what, does, hint) in _USES.items():
+            limit, now = own.get(key), used.get(key)
+            if limit is not None and now is not None and limit < now:
+                raise DoraSystemdError(
+                    f"cannot limit the {what} of {whose} to {_shown(key, limit)}: "
+                    f"it {does} {_shown(key, now)} now",
+                    f"--force does it; {hint}",
+                )
 
 
 def check_kept(limit: int | None, kept: int) -> None:
@@ -150,11 +161,13 @@ def _above(
     for key, most in bounds.items():
         value = limits.get(key, 0)
         if most < value < INFINITY:
-            limit = f"the limit {key}={_shown(key, value)} of {whose}"
-            yield f"{limit} is more than {there}: {_shown(key, most)}"
+            limit, bound = _shown(key, value), _shown(key, most)
+            if limit == bound:  # rounded; only sizes are
+                limit, bound = (f"{one // _MEGABYTE}M" for one in (value, most))
+            yield f"the limit {key}={limit} of {whose} is more than {there}: {bound}"
 
 
 def _shown(key: str, value: int) -> str:
     if key == "cpu_limit":
-        return f"{value / SECOND:g} cores"
+        return f"{value / SECOND:g} core{'' if value == SECOND else 's'}"
     return str(value) if key == "tasks_limit" else format_rounded_size(value)

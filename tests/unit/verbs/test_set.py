@@ -162,6 +162,23 @@ def test_a_limit_below_what_the_dataflow_uses(place: Place) -> None:
     assert (caught.value.message, place.manager.calls) == (told, [])
 
 
+def test_no_process_can_start_below_the_present_tasks(place: Place) -> None:
+    """The next restart of a node would fail, and that of the dataflow, without a reason."""
+    whole = place.group.parent
+    (whole / "pids.current").write_text("73")
+    (place.group / "pids.current").write_text("19")
+    for flags, what in (
+        ({"tasks_limit": "72"}, "the dataflow to 72: it has 73 now"),
+        ({"nodes": ("camera:tasks_limit=18",)}, "the node camera to 18: it has 19 now"),
+    ):
+        with pytest.raises(DoraSystemdError) as caught:
+            place.set(**flags)
+        assert caught.value.message == f"cannot limit the tasks of {what}"
+        assert caught.value.hint == "--force does it; no process and no thread can start then"
+        set_limits(place.manager, place.scope, place.cell, flags, is_forced=True)
+    place.set(nodes=("camera:tasks_limit=19",), tasks_limit="73")
+
+
 def test_no_force_for_a_limit_that_systemd_would_hang_in(place: Place) -> None:
     (place.root / "cgroup/unit/memory.stat").write_text(f"anon {40 << 20}\nshmem {8 << 20}\n")
     flags = {"memory_limit": "19M"}

@@ -185,6 +185,22 @@ def test_controllers() -> None:
         assert hint in caught.value.hint
 
 
+def test_the_controller_that_a_user_lacks_is_delegated_by_the_hint() -> None:
+    for controller in ("cpu", "cpuset", "memory", "pids", "io"):
+        with pytest.raises(DoraSystemdError) as caught:
+            check_controllers({controller: "a limit"}, {"x"}, is_user=True)
+        assert controller in caught.value.hint.partition("Delegate=")[2].split()
+
+
+def test_sizes_that_look_the_same_and_one_core() -> None:
+    machine = Machine(memory=2 * GIB - 30 * 1024**2, cores=1, tasks=4096)
+    limits = {"memory_limit": 2 * GIB, "cpu_limit": 2 * 10**6}
+    assert size_warnings(limits, [], machine) == (
+        "the limit memory_limit=2048M of the dataflow is more than this machine has: 2018M",
+        "the limit cpu_limit=2 cores of the dataflow is more than this machine has: 1 core",
+    )
+
+
 def test_more_than_there_is() -> None:
     machine = Machine(memory=8 * GIB, cores=4, tasks=4096)
     fine = {"memory_limit": 8 * GIB, "cpu_limit": 4 * 10**6, "tasks_limit": INFINITY}
