@@ -26,15 +26,15 @@ MAX_NAME = 186
 characters, for PrivateTmp=, and file names have at most 255."""
 
 _LASTS = "".join(f"\\U{plane:04x}fffe\\U{plane:04x}ffff" for plane in range(17))
-_UNREADABLE = re.compile(f"[\\x00\\ud800-\\udfff\\ufdd0-\\ufdef{_LASTS}]")
+_UNREADABLE = f"[\\x00\\ud800-\\udfff\\ufdd0-\\ufdef{_LASTS}]"
 """NUL, surrogates, and what Unicode calls noncharacters."""
-_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}(?<!-)")
+_NAME = rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}(?<!-)"
 """No "-" at its end: drop-ins of dora-x-.service are of all units dora-x-*, see systemd.unit(5)."""
 MAX_NODE_ID = 200
 """Maximum characters: "node-ID" is a cgroup and "ID.out" a pipe, with names of at most 255 bytes.
 """
 
-NODE_ID = re.compile(r"(?!\.)[A-Za-z0-9_.-]+")
+NODE_ID = r"(?!\.)[A-Za-z0-9_.-]+"
 """dora's own rule for node ids."""
 
 _UNIT_SUFFIXES = (
@@ -46,10 +46,10 @@ STORE = "dora-systemd/releases"
 TREE = "tree"
 """The directory of a project's files in a release."""
 _RELEASE = r"[0-9]{8}T[0-9]{6}(?:-[0-9a-f]{4,64}\+?)?(?:\.[0-9]{1,4})?"
-_RELEASE_PLACE = re.compile(rf"/{STORE}/[^/]+/({_RELEASE})/{TREE}/")
-_UUID = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+_RELEASE_PLACE = rf"/{STORE}/[^/]+/({_RELEASE})/{TREE}/"
+_UUID = r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}"
 _ZERO_UUID = "00000000-0000-0000-0000-000000000000"
-_DESCRIPTION = re.compile(rf"dora dataflow (\S+) \(({_UUID.pattern})\)(?:, release ({_RELEASE}))?")
+_DESCRIPTION = rf"dora dataflow (\S+) \(({_UUID})\)(?:, release ({_RELEASE}))?"
 MIN_PREFIX = 4
 """Minimum characters of the beginning of a UUID."""
 _HINT = (
@@ -81,7 +81,7 @@ def is_name(text: str) -> bool:
 def parse_name(text: str) -> str:
     """Return a valid name unchanged. Raises DoraSystemdError (USAGE) for any other text."""
     hint = ""
-    if not _NAME.fullmatch(text):
+    if not re.fullmatch(_NAME, text):
         hint = _HINT
     elif text.endswith(_UNIT_SUFFIXES):
         hint = "leave the unit suffix out: the unit is dora-NAME.service"
@@ -152,7 +152,7 @@ def unit_description(name: str, uuid: str, release: str = "") -> str:
 def facts_from_description(unit: str, description: str) -> tuple[str, str] | None:
     """The UUID and the release, or "", in the Description= of a unit of ours; None if neither."""
     name = name_from_unit(unit)
-    found = _DESCRIPTION.fullmatch(description)
+    found = re.fullmatch(_DESCRIPTION, description)
     return (found[2], found[3] or "") if found and name and found[1] == name else None
 
 
@@ -166,18 +166,18 @@ def release_of(path: str) -> str:
 
     There is no registry: the unit names its dataflow file, and that path has the release in it.
     """
-    found = _RELEASE_PLACE.search(path)
+    found = re.search(_RELEASE_PLACE, path)
     return found[1] if found else ""
 
 
 def is_node_id(text: str) -> bool:
     """Whether it is a valid node id for dora and for a cgroup."""
-    return len(text) <= MAX_NODE_ID and NODE_ID.fullmatch(text) is not None
+    return len(text) <= MAX_NODE_ID and re.fullmatch(NODE_ID, text) is not None
 
 
 def is_uuid(text: str) -> bool:
     """Whether it is a UUID in lower case with dashes."""
-    return _UUID.fullmatch(text) is not None
+    return re.fullmatch(_UUID, text) is not None
 
 
 def parse_uuid(text: str) -> str:
@@ -227,4 +227,4 @@ def is_readable(text: str) -> bool:
     Surrogates stand for bytes that are not UTF-8. D-Bus allows no NUL, and C would silently cut the
     string there.
     """
-    return not _UNREADABLE.search(text)
+    return not re.search(_UNREADABLE, text)

@@ -10,24 +10,24 @@ import re
 # C0 without tab and newline, DEL, C1; bidirectional controls; separators that some programs take
 # for line ends; surrogates, which stand for bytes of file names that are not UTF-8; language tags,
 # which are invisible.
-_COMMANDS = re.compile(
+_COMMANDS = (
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
     "\ud800-\udfff\ufeff\U000e0000-\U000e007f]"
 )
-_SEQUENCES = re.compile(
+_SEQUENCES = (
     r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"  # CSI
     r"|(?:\x1b[PX\]^_]|[\x90\x98\x9d-\x9f])[^\x07\x1b\x9c]*(?:\x07|\x1b\\|\x9c)?"  # OSC, DCS ...
     r"|\x1b[@-Z\\-_]"
 )
-_COLORS = re.compile(r"\x1b\[[0-9;:]*m")
-COLOR_BYTES = re.compile(_COLORS.pattern.encode())
+_COLORS = r"\x1b\[[0-9;:]*m"
+COLOR_BYTES = _COLORS.encode()
 """Sequences that set colours, in bytes."""
 _RESET = "\x1b[0m"
 
 
 def escaped(text: str) -> str:
     r"""`text` as a terminal may be given it: what would command it is shown, as in \x1b."""
-    return _COMMANDS.sub(_escape, text)
+    return re.sub(_COMMANDS, _escape, text)
 
 
 def one_line(text: str) -> str:
@@ -65,7 +65,7 @@ def cut(text: str, width: int | None) -> str:
 
 def without_sequences(text: str) -> str:
     """`text` without colours and other complete sequences, for output without colours."""
-    return _SEQUENCES.sub("", text)
+    return re.sub(_SEQUENCES, "", text)
 
 
 def shown_log(data: bytes) -> bytes:
@@ -74,16 +74,16 @@ def shown_log(data: bytes) -> bytes:
     Escapes bytes that are not UTF-8, and everything else that a terminal would interpret.
     """
     text = data.decode("utf-8", "backslashreplace")
-    if not _COMMANDS.search(text):
+    if not re.search(_COMMANDS, text):
         return text.encode()
     return "\n".join(_shown_line(line.rstrip("\r")) for line in text.split("\n")).encode()
 
 
 def _shown_line(line: str) -> str:
-    pieces = _COLORS.split(line)
+    pieces = re.split(_COLORS, line)
     if len(pieces) == 1:
         return escaped(line)
-    colors = [*_COLORS.findall(line), ""]
+    colors = [*re.findall(_COLORS, line), ""]
     shown = "".join(escaped(text) + color for text, color in zip(pieces, colors, strict=True))
     return shown if shown.endswith(_RESET) else f"{shown}{_RESET}"
 

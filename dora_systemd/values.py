@@ -18,7 +18,7 @@ INFINITY = 2**64 - 1
 SECOND = 1_000_000
 """Microseconds per second."""
 
-_SIZE = re.compile(r"([0-9]+)(?:\.([0-9]+))?\s*([KMGTPE]?)B?")
+_SIZE = r"([0-9]+)(?:\.([0-9]+))?\s*([KMGTPE]?)B?"
 _SIZE_FACTORS = {suffix: 1024**power for power, suffix in enumerate(" KMGTPE") if power} | {"": 1}
 _SIZE_HINT = "write bytes, or a number with K, M, G or T (powers of 1024) such as 512M; or infinity"
 
@@ -35,10 +35,10 @@ _DURATION_UNITS = {
     **dict.fromkeys(("years", "year", "y"), 31_557_600 * SECOND),
 }
 _DURATION_NAMES = (("d", _DAY), ("h", _HOUR), ("min", _MINUTE), ("s", SECOND), ("ms", 1000))
-_SPAN = re.compile(r"\s*([0-9]+)(?:\.([0-9]+))?\s*([a-zA-Zµμ]*)")
+_SPAN = r"\s*([0-9]+)(?:\.([0-9]+))?\s*([a-zA-Zµμ]*)"
 _DURATION_HINT = "write seconds, or a time span such as 500ms, 10s or 1min 30s; or infinity"
 
-_CPU = re.compile(r"([0-9]+)(?:\.([0-9]+))?(%?)")
+_CPU = r"([0-9]+)(?:\.([0-9]+))?(%?)"
 _CPU_STEP = 100
 _CPU_HINT = "write cores such as 1.5, or a share of one core such as 150%; or infinity"
 
@@ -72,7 +72,7 @@ def parse_size(text: str) -> int:
     """Bytes; K, M, G, T, P and E are powers of 1024 as in systemd.resource-control(5)."""
     if text.strip() == "infinity":
         return INFINITY
-    match = _SIZE.fullmatch(text.strip())
+    match = re.fullmatch(_SIZE, text.strip())
     size = _scaled(match[1], match[2], _SIZE_FACTORS[match[3]]) if match else None
     if size is None:
         raise _refusal("size", text, _SIZE_HINT)
@@ -106,7 +106,7 @@ def parse_duration(text: str) -> int:
     if text.strip() == "infinity":
         return INFINITY
     spans, end = [], 0
-    while match := _SPAN.match(text, end):
+    while match := re.compile(_SPAN).match(text, end):
         factor = _DURATION_UNITS.get(match[3])
         spans.append(None if factor is None else _scaled(match[1], match[2], factor))
         end = match.end()
@@ -135,7 +135,7 @@ def parse_cpu(text: str) -> int:
     """
     if text.strip() == "infinity":
         return INFINITY
-    match = _CPU.fullmatch(text.strip())
+    match = re.fullmatch(_CPU, text.strip())
     one = SECOND // 100 if match and match[3] else SECOND
     share = _scaled(match[1], match[2], one) if match else None
     if share is None or share < _CPU_STEP:
@@ -187,7 +187,7 @@ _FIRST_CPU = INFINITY.bit_length()
 """CPUs are bits of a number, as limits are numbers. The first bit is above INFINITY: no limit."""
 MOST_CPUS = 8192
 """What Linux can be built for."""
-_CPU_RANGE = re.compile(r"([0-9]{1,4})(?:-([0-9]{1,4}))?")
+_CPU_RANGE = r"([0-9]{1,4})(?:-([0-9]{1,4}))?"
 
 
 def cpu_bits(cpus: Iterable[int]) -> int:
@@ -201,7 +201,7 @@ def parse_cpus(text: str) -> int:
         return INFINITY
     bits = 0
     for part in text.split(","):
-        match = _CPU_RANGE.fullmatch(part.strip())
+        match = re.fullmatch(_CPU_RANGE, part.strip())
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         if not first <= last < MOST_CPUS:
             hint = "write numbers and ranges such as 2-3 or 0,2; or infinity for all"

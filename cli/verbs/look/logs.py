@@ -28,8 +28,8 @@ from dora_systemd.verbs.logs import has_unit, pass_logs, read_logs, unit_places,
 Lines = TerminalLines | ShownLines | None
 """Formats lines for a terminal; None for a pipe."""
 
-_BOOT_OPTION = re.compile("-[afqr]*b|--boot")
-_COUNT = re.compile("[0-9]+")
+_BOOT_OPTION = "-[afqr]*b|--boot"
+_COUNT = "[0-9]+"
 _LEFT_OUT = "some messages have control characters; --all prints them, too"
 
 
@@ -39,7 +39,7 @@ class LogsCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         words: list[str] = []
         for word in [*args, ""]:
-            if words and _BOOT_OPTION.fullmatch(words[-1]):
+            if words and re.fullmatch(_BOOT_OPTION, words[-1]):
                 words[-1] += "=" if words[-1] == "--boot" else ""
                 words[-1] += word if is_boot(word) else "0"
                 if is_boot(word):
@@ -212,7 +212,7 @@ def _print_machines(scope: Scope) -> int | None:
 def last_count(values: Sequence[str]) -> str:
     """The number of lines, "" for none. Raises DoraSystemdError (USAGE)."""
     for value in values:
-        if value != ALL_LINES and not _COUNT.fullmatch(value):
+        if value != ALL_LINES and not re.fullmatch(_COUNT, value):
             message = f"cannot use {quoted(value)} as a number of lines"
             raise usage_error(message, "a number such as 100, or all")
     return values[-1] if values else ""

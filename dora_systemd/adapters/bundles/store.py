@@ -161,7 +161,7 @@ _MOST_NAMES = 10_000
 _ENDING = ".tar"
 STAMP = "%Y%m%dT%H%M%SZ"
 """The form of the time in a name, for strftime(3)."""
-_NAME = re.compile(r"-([0-9]{8}T[0-9]{6}Z(?:\.[0-9]{1,3})?)-([a-z-]{1,40})\.tar")
+_NAME = r"-([0-9]{8}T[0-9]{6}Z(?:\.[0-9]{1,3})?)-([a-z-]{1,40})\.tar"
 _GIB, _PERCENT = 1 << 30, 15
 _REFUSED = ".refused"
 """The file that counts the bundles that were not written."""
@@ -217,7 +217,7 @@ class BundleStore:
 
     def _stored(self, name: str) -> Stored | None:
         begin, rest = name[: len(self.name)], name[len(self.name) :]
-        found = _NAME.fullmatch(rest)
+        found = re.fullmatch(_NAME, rest)
         if begin != self.name or not found:
             return None
         try:

@@ -9,7 +9,7 @@ from dora_systemd.decisions.resources.pressure import Load
 from dora_systemd.decisions.resources.usage import RESOURCES, Strain
 from dora_systemd.values import INFINITY
 
-_PRESSURE = re.compile(r"^(some|full) avg10=([0-9.]+)(?: avg60=([0-9.]+))?.* total=(\d+)$", re.M)
+_PRESSURE = r"(?m)^(some|full) avg10=([0-9.]+)(?: avg60=([0-9.]+))?.* total=(\d+)$"
 
 
 def read_strain(path: Path) -> Strain:
@@ -54,13 +54,13 @@ def read_waited(path: Path) -> float | None:
 
     This includes throttling by a CPU limit. None if the kernel does not measure it.
     """
-    match = _PRESSURE.search(read_text(path / "cpu.pressure"))
+    match = re.search(_PRESSURE, read_text(path / "cpu.pressure"))
     return float(match[3]) if match and match[3] else None
 
 
 def _read_stalls(path: str) -> tuple[int, int] | None:
     """Read both totals of a pressure file in µs; None if the kernel does not measure them."""
-    totals = {kind: int(total) for kind, *_, total in _PRESSURE.findall(read_text(path))}
+    totals = {kind: int(total) for kind, *_, total in re.findall(_PRESSURE, read_text(path))}
     if not totals:
         return None
     # Interrupt handlers stop whole CPUs: irq.pressure has no "some".
@@ -69,5 +69,5 @@ def _read_stalls(path: str) -> tuple[int, int] | None:
 
 def _read_stalled(path: Path) -> float:
     """avg10 of "some" in memory.pressure, see the kernel's "PSI" document; 0 where it is off."""
-    match = _PRESSURE.search(read_text(path / "memory.pressure"))
+    match = re.search(_PRESSURE, read_text(path / "memory.pressure"))
     return float(match[2]) if match else 0.0

@@ -6,6 +6,7 @@ the user runs it, in the sandbox, with the environment of the nodes.
 
 import contextlib
 import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -98,7 +99,7 @@ def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> s
     reason = refusal_reason(done)
     if UNSET_OR_OTHER in reason and (names := _unset(options.dataflow, environment)):
         return reason.replace(UNSET_OR_OTHER, f"{UNSET}: {', '.join(names)}")
-    return name_input(reason, _document(options.dataflow)) if UNNAMED.search(reason) else reason
+    return name_input(reason, _document(options.dataflow)) if re.search(UNNAMED, reason) else reason
 
 
 def _unset(dataflow: str, environment: Mapping[str, str]) -> list[str]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 LISTENING = "Listening on port "
 """What a coordinator prints before its port, once it has written its token."""
-_PORT = re.compile(rf"^{LISTENING}(\d+)\n".encode(), re.MULTILINE)
+_PORT = rf"(?m)^{LISTENING}(\d+)\n".encode()
 _CHUNK = 4096
 
 
@@ -107,7 +107,7 @@ def read_port(coordinator: Child, seconds: float) -> int:
     while poll.poll(max(deadline - time.monotonic(), 0) * 1000):
         chunk = os.read(coordinator.output, _CHUNK)
         coordinator.said.extend(chunk)
-        found = _PORT.search(coordinator.said)
+        found = re.search(_PORT, coordinator.said)
         if found or not chunk:
             return int(found[1]) if found else 0
     return 0

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 PROC = Path("/proc")
 
 _MOST_BYTES = 256 * 1024
-_SOCKET = re.compile(r"socket:\[(\d+)\]")
+_SOCKET = r"socket:\[(\d+)\]"
 _MOST_OF_LOCKS = 8 * 1024 * 1024
 """Bytes read of /proc/locks: 100,000 locks."""
 _MOST_OF_PROCESS = 4096
-_FLOCK = re.compile(rb"\d+: FLOCK +\S+ +(?:READ|WRITE) +(\d+) ([0-9a-f]+:[0-9a-f]+):(\d+) ")
+_FLOCK = rb"\d+: FLOCK +\S+ +(?:READ|WRITE) +(\d+) ([0-9a-f]+:[0-9a-f]+):(\d+) "
 
 
 def read_processes(proc: Path = PROC) -> "list[Process]":
@@ -104,7 +104,7 @@ def _holds(directory: Path, inodes: Collection[int]) -> bool:
     with contextlib.suppress(OSError):
         for path in directory.iterdir():
             with contextlib.suppress(OSError):
-                match = _SOCKET.fullmatch(os.readlink(path))  # noqa: PTH115
+                match = re.fullmatch(_SOCKET, os.readlink(path))  # noqa: PTH115
                 if match and int(match[1]) in inodes:
                     return True
     return False
@@ -129,7 +129,8 @@ def read_flocks(device: int) -> Mapping[int, tuple[int, ...]]:
     wanted = b"%02x:%02x" % (os.major(device), os.minor(device))
     found: defaultdict[int, tuple[int, ...]] = defaultdict(tuple)
     with suppress(OSError), (PROC / "locks").open("rb") as file:
-        for match in map(_FLOCK.match, file.read(_MOST_OF_LOCKS).split(b"\n")):
+        for line in file.read(_MOST_OF_LOCKS).split(b"\n"):
+            match = re.match(_FLOCK, line)
             if match and match[2] == wanted:
                 found[int(match[3])] += (int(match[1]),)
     return found

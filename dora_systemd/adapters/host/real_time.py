@@ -14,7 +14,7 @@ from dora_systemd.errors import DoraSystemdError
 _CPUS = "sys/devices/system/cpu"
 _CONFIGS = ("proc/config.gz", f"boot/config-{os.uname().release}")
 _OPTION = "CONFIG_RT_GROUP_SCHED"
-_AT_BOOT = re.compile(r"\brt_group_sched=([01])\b")
+_AT_BOOT = r"\brt_group_sched=([01])\b"
 _CONTROLLERS = "sys/fs/cgroup/cgroup.controllers"
 _BOUNDING = re.compile(r"^CapBnd:\s*([0-9a-f]+)$", re.M)
 _CAP_SYS_RESOURCE = 1 << 24
@@ -44,7 +44,7 @@ def _has_groups(root: Path) -> bool | None:
     lines = next(filter(None, (_config(root / one) for one in _CONFIGS)), "").splitlines()
     if not lines:
         return None
-    said = _AT_BOOT.findall(_text(root / "proc/cmdline"))
+    said = re.findall(_AT_BOOT, _text(root / "proc/cmdline"))
     is_on = said[-1] == "1" if said else f"{_OPTION}_DEFAULT_DISABLED=y" not in lines
     controllers = root / _CONTROLLERS
     is_used = not controllers.exists() or "cpu" in _text(controllers).split()

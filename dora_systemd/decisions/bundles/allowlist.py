@@ -156,8 +156,8 @@ def _kept_holder(holder: Holder) -> Holder:
     return holder._replace(command="")
 
 
-_KILL = re.compile(r"(oom-kill:.*|Killed process )")
-_PID = re.compile(r"\bpid=([0-9]+)|Killed process ([0-9]+)")
+_KILL = r"(oom-kill:.*|Killed process )"
+_PID = r"\bpid=([0-9]+)|Killed process ([0-9]+)"
 
 
 def is_kill_of(message: str, unit: str, pids: set[str]) -> bool:
@@ -166,7 +166,7 @@ def is_kill_of(message: str, unit: str, pids: set[str]) -> bool:
     pids: of processes of the unit that the kernel has named, which gets one more. A record names
     the group, and the next one only the process.
     """
-    if not (_KILL.search(message) and (found := _PID.search(message))):
+    if not (re.search(_KILL, message) and (found := re.search(_PID, message))):
         return False
     pid = found[1] or found[2]
     if f"/{unit}" in message:

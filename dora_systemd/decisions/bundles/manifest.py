@@ -20,8 +20,8 @@ RULES = "allowlist 1: no values of variables, no arguments, settings or credenti
 README, WHY, MANIFEST, ERRORS = "README.txt", "why.json", "manifest.json", "errors.txt"
 MOST_MANIFEST = 1 << 20
 MOST_PARTS = 256
-_NAME = re.compile(r"(?!\.)[A-Za-z0-9_.-]{1,200}(/(?!\.)[A-Za-z0-9_.-]{1,200})?")
-_DIGEST = re.compile(r"[0-9a-f]{64}")
+_NAME = r"(?!\.)[A-Za-z0-9_.-]{1,200}(/(?!\.)[A-Za-z0-9_.-]{1,200})?"
+_DIGEST = r"[0-9a-f]{64}"
 
 
 class Part(NamedTuple):
@@ -55,7 +55,7 @@ class Manifest:
 
 def is_part_name(name: str) -> bool:
     """Whether it can be the name of a file in a bundle: no path that leads out of a directory."""
-    return _NAME.fullmatch(name) is not None
+    return re.fullmatch(_NAME, name) is not None
 
 
 def format_manifest(one: Manifest) -> str:
@@ -131,7 +131,7 @@ def _parsed(values: Mapping[str, Any]) -> Manifest:
 def _part(value: Any) -> Part:
     known = as_mapping(value)
     name, digest = _text(known["name"]), _text(known["digest"])
-    if not is_part_name(name) or not _DIGEST.fullmatch(digest):
+    if not is_part_name(name) or not re.fullmatch(_DIGEST, digest):
         raise ValueError(name)
     return Part(name, _number(known["size"]), digest)
 

@@ -37,9 +37,9 @@ _JOURNAL = (
 )
 
 
-_OF_LOG = re.compile(r"  (?:[0-9]{2}-[0-9]{2} )?[0-9]{2}:[0-9]{2}:[0-9]{2}  ")
+_OF_LOG = r"  (?:[0-9]{2}-[0-9]{2} )?[0-9]{2}:[0-9]{2}:[0-9]{2}  "
 """The beginning of an event, or of a line of a node: as in `why`, these are cut."""
-_LABEL = re.compile(r"  \S+: +|  \S+ {2,}|  ")
+_LABEL = r"  \S+: +|  \S+ {2,}|  "
 
 
 def fitted(lines: Iterable[str], width: int) -> Iterator[str]:
@@ -48,10 +48,10 @@ def fitted(lines: Iterable[str], width: int) -> Iterator[str]:
     The terminal wraps the commands: then they can be copied.
     """
     for line in lines:
-        label = _LABEL.match(line)
+        label = re.match(_LABEL, line)
         if line in _JOURNAL:
             yield line
-        elif not line or _OF_LOG.match(line):
+        elif not line or re.match(_OF_LOG, line):
             yield cut(line, width)
         else:
             yield from wrapped(line, width, min(label.end(), width // 2) if label else 0)

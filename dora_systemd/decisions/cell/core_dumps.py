@@ -4,15 +4,15 @@ import re
 
 CORE_PATTERN = "proc/sys/kernel/core_pattern"
 # systemd 262 has the second form, with Linux 6.17.
-_COREDUMP = re.compile(r"\|(\S*/systemd-coredump)(?:\s|$)|@@?/run/systemd/coredumpd/")
+_COREDUMP = r"\|(\S*/systemd-coredump)(?:\s|$)|@@?/run/systemd/coredumpd/"
 
 
 def keeps_core_dumps(pattern: str) -> bool:
     """Whether systemd-coredump(8) gets the core dumps."""
-    return _COREDUMP.match(pattern.strip()) is not None
+    return re.match(_COREDUMP, pattern.strip()) is not None
 
 
 def core_program(pattern: str) -> str:
     """The path of systemd-coredump in the pattern, "" for another pattern."""
-    found = _COREDUMP.match(pattern.strip())
+    found = re.match(_COREDUMP, pattern.strip())
     return (found[1] or "") if found else ""

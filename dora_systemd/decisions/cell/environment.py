@@ -21,8 +21,8 @@ MAX_ENTRY = 128 * 1024 - 1
 """Maximum bytes of one `KEY=VALUE`: execve(2) refuses a longer one (MAX_ARG_STRLEN) with its NUL.
 """
 
-_KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
+_KEY = r"[A-Za-z_][A-Za-z0-9_]*"
+_CONTROL = r"[\x00-\x08\x0a-\x1f\x7f]"
 LOCK_VARIABLE = "DORA_INHIBIT_LOCK"
 """Variable of the nodes with the path of the file that they lock to inhibit restarts."""
 SET_VARIABLE = "DORA_SYSTEMD_SET"
@@ -98,11 +98,11 @@ def parse_assignment(text: str) -> tuple[str, str]:
 
 def checked_variable(key: str, value: str) -> tuple[str, str]:
     """Return `key` and `value`, or raise as parse_assignment does. No error shows the value."""
-    if not _KEY.fullmatch(key):
+    if not re.fullmatch(_KEY, key):
         raise _refusal(key, "a name is letters, digits and '_', and begins with no digit")
     if key in _RESERVED:
         raise _refusal(key, "systemd sets this one itself")
-    if _CONTROL.search(value) or not is_readable(value):
+    if re.search(_CONTROL, value) or not is_readable(value):
         raise _refusal(key, "a value is one line of text without control characters")
     if len(f"{key}={value}".encode()) > MAX_ENTRY:
         raise _refusal(key, "a value has at most 128 KiB: put it in a file and give its path")
@@ -139,7 +139,7 @@ def environment_entries(variables: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _is_usable(entry: str) -> bool:
-    return entry.startswith("/") and not _CONTROL.search(entry) and is_readable(entry)
+    return entry.startswith("/") and not re.search(_CONTROL, entry) and is_readable(entry)
 
 
 def _refusal(key: str, hint: str) -> DoraSystemdError:

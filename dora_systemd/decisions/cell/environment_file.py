@@ -10,15 +10,14 @@ from dora_systemd.decisions.cell.environment import parse_assignment
 from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.values import shown
 
-_ENTRY = re.compile(r"(?:\s|[#;].*)*(?P<key>[^=\n]*)(?P<equals>=?)")
+_ENTRY = r"(?:\s|[#;].*)*(?P<key>[^=\n]*)(?P<equals>=?)"
 """A name, and the blank lines and comments before it."""
-_PART = re.compile(
-    r"""[ \t\r]*(?:'(?P<single>[^']*)(?P<end>')?|"(?P<double>(?:[^"\\]|\\.)*)(?P<ends>")?)""",
-    re.DOTALL,
+_PART = (
+    r"""(?s)[ \t\r]*(?:'(?P<single>[^']*)(?P<end>')?|"(?P<double>(?:[^"\\]|\\.)*)(?P<ends>")?)"""
 )
-_REST = re.compile(r"(?:[^\n\\]|\\.)*\\?", re.DOTALL)
-_WORD = re.compile(r"[^\\]+|\\.?", re.DOTALL)
-_ESCAPED = re.compile(r"""\\(["\\$`])|\\\n""")
+_REST = r"(?s)(?:[^\n\\]|\\.)*\\?"
+_WORD = r"(?s)[^\\]+|\\.?"
+_ESCAPED = r"""\\(["\\$`])|\\\n"""
 _BLANK = " \t\r"
 
 
@@ -29,7 +28,7 @@ def parse_environment_file(text: str, source: str) -> dict[str, str]:
     """
     variables: dict[str, str] = {}
     place = 0
-    while (match := _ENTRY.match(text, place)) and match[0]:
+    while (match := re.compile(_ENTRY).match(text, place)) and match[0]:
         place = match.end()
         try:
             if match["equals"]:
@@ -49,21 +48,21 @@ def parse_environment_file(text: str, source: str) -> dict[str, str]:
 def _value(text: str, place: int) -> tuple[str, int]:
     """Read the value that begins at `place`; return the value and where it ends."""
     parts = []
-    while match := _PART.match(text, place):
+    while match := re.compile(_PART).match(text, place):
         if not (match["end"] or match["ends"]):
             hint = "a quote is not closed: a value is one line of text"
             raise usage_error("cannot read a value", hint)
         place = match.end()
         in_double = match["double"]
-        parts.append(match["single"] if in_double is None else _ESCAPED.sub(r"\1", in_double))
-    rest = _REST.match(text, place)
+        parts.append(match["single"] if in_double is None else re.sub(_ESCAPED, r"\1", in_double))
+    rest = re.compile(_REST).match(text, place)
     assert rest is not None
     return "".join([*parts, _without_quotes(rest[0])]), rest.end()
 
 
 def _without_quotes(text: str) -> str:
     """Return text in which a backslash makes the next character literal, also a last blank."""
-    words = _WORD.findall(text.lstrip(_BLANK))
+    words = re.findall(_WORD, text.lstrip(_BLANK))
     if words and not words[-1].startswith("\\"):
         words[-1] = words[-1].rstrip(_BLANK)
     return "".join(word[1:].strip("\n") if word.startswith("\\") else word for word in words)

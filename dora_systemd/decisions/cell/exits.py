@@ -52,7 +52,7 @@ class Exit(NamedTuple):
 
 _BECAUSE, _FAILED = " because node ", " failed"
 _NODE, _EARLY = "node ", " failed before the start"
-_NUMBERED = re.compile(r"(exit code |signal )(-?(?:0|[1-9][0-9]{0,9})|SIG[A-Z0-9]+)")
+_NUMBERED = r"(exit code |signal )(-?(?:0|[1-9][0-9]{0,9})|SIG[A-Z0-9]+)"
 
 
 def _signal_name(number: int) -> str:
@@ -93,7 +93,7 @@ def _parse_own(text: str) -> Exit:
     for kind in (ExitKind.HUNG, ExitKind.SILENT):
         if text.startswith(kind.value):
             return Exit(kind, words=text.removeprefix(kind.value))
-    if numbered := _NUMBERED.match(text):
+    if numbered := re.match(_NUMBERED, text):
         kind, words = ExitKind(numbered[1]), text[numbered.end() :]
         if kind is ExitKind.CODE and not numbered[2].startswith("SIG"):
             return Exit(kind, int(numbered[2]), words)
@@ -104,5 +104,5 @@ def _parse_own(text: str) -> Exit:
 
 def find_exit(text: str) -> Exit:
     """Find the first exit status or signal in a text; Exit() for none."""
-    numbered = _NUMBERED.search(text)
+    numbered = re.search(_NUMBERED, text)
     return parse_exit(text[numbered.start() :]) if numbered else Exit()

@@ -38,7 +38,7 @@ HIGHEST_WEIGHT = 10_000
 _PERIOD = 100_000
 """µs: the kernel's default period of cpu.max."""
 
-_NUMBER = re.compile(r"[0-9]{1,18}")
+_NUMBER = r"[0-9]{1,18}"
 
 CPUS = "cpus"
 """The limit that is no amount: which CPUs, see dora_systemd.values."""
@@ -77,7 +77,7 @@ def parse_weight(text: str) -> int:
 
 
 def _parse_number(text: str, lowest: int, highest: int, what: str, hint: str) -> int:
-    if not _NUMBER.fullmatch(text.strip()) or not lowest <= int(text) <= highest:
+    if not re.fullmatch(_NUMBER, text.strip()) or not lowest <= int(text) <= highest:
         raise usage_error(f"cannot use {quoted(text)} as {what}", hint)
     return int(text)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 _BOUNDS = {"max_log_size": "16MB", "max_rotated_files": 1}
 """Limits for these log files, which are in the RuntimeDirectory and so in memory."""
-_SIZE = re.compile(r"([0-9]{1,18}) *([KMG]?)B?", re.IGNORECASE)
+_SIZE = r"(?i)([0-9]{1,18}) *([KMG]?)B?"
 _FACTORS = {"": 1, "K": 1000, "M": 1000**2, "G": 1000**3}
 BREATH = 0.02
 """Seconds that a node runs at least between two freezes: it has other work to do."""
@@ -57,7 +57,7 @@ def marks_of(raw: Mapping[str, Any]) -> Marks:
 
 
 def _capacity(size: object, files: object) -> int:
-    match = _SIZE.fullmatch(str(size))
+    match = re.fullmatch(_SIZE, str(size))
     if match is None or not isinstance(files, int):
         return 4 * MARKS.hold
     return int(match[1]) * _FACTORS[match[2].upper()] * max(files, 1)

@@ -14,7 +14,7 @@ from dora_systemd.values import quoted
 
 HEAD = "head"
 """The machine of a node that runs on the head, where a word is needed; no member has this name."""
-_HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,252}")
+_HOST_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,252}"
 
 
 class Placed(NamedTuple):
@@ -41,7 +41,7 @@ def parse_machine(text: str) -> str:
 
 def is_host_name(text: str) -> bool:
     """Return whether a text can be the host name of the head."""
-    return _HOST_NAME.fullmatch(text) is not None
+    return re.fullmatch(_HOST_NAME, text) is not None
 
 
 def parse_head(text: str) -> str:

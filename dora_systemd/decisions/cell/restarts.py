@@ -37,7 +37,7 @@ MOST_COUNTED = 64
 _HAND_STARTS = 30
 """Starts in one window that are no automatic restarts. StartLimitBurst= counts them as well, so it
 is that much larger than the budget, which the runner keeps: see runner/cell/restarts.py."""
-_COUNT = re.compile(r"[0-9]{1,9}")
+_COUNT = r"[0-9]{1,9}"
 
 
 class RestartPolicy(NamedTuple):
@@ -130,7 +130,7 @@ def parse_count(text: str) -> int:
     """A number of restarts, or INFINITY. Raises DoraSystemdError (USAGE)."""
     if text.strip() == "infinity":
         return INFINITY
-    if not _COUNT.fullmatch(text.strip()) or not 1 <= int(text) <= MAX_RESTARTS:
+    if not re.fullmatch(_COUNT, text.strip()) or not 1 <= int(text) <= MAX_RESTARTS:
         raise usage_error(
             f"cannot use {quoted(text)} as a number of restarts",
             "write 1 or more, or infinity; for none use --restart-policy no",

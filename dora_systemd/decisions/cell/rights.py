@@ -24,8 +24,8 @@ MOST_OOM = 1000
 REALTIME = ("fifo", "rr")
 _SHARING = ("batch", "idle", "other")
 _POLICIES = (*(f"{policy}:PRIORITY" for policy in REALTIME), *_SHARING)
-_PRIORITY = re.compile(r"0*([1-9][0-9]?)")
-_INTEGER = re.compile(r"[-+]?[0-9]{1,4}")
+_PRIORITY = r"0*([1-9][0-9]?)"
+_INTEGER = r"[-+]?[0-9]{1,4}"
 
 
 def parse_scheduling(given: str) -> str:
@@ -33,7 +33,7 @@ def parse_scheduling(given: str) -> str:
     policy, colon, priority = given.strip().partition(":")
     if policy in _SHARING and not colon:
         return policy
-    number = _PRIORITY.fullmatch(priority)
+    number = re.fullmatch(_PRIORITY, priority)
     if policy in REALTIME and number:
         return f"{policy}:{number[1]}"
     hint = f"write {policy}:PRIORITY with 1 to 99, such as {policy}:50"
@@ -56,7 +56,7 @@ def parse_oom(given: str) -> int:
 
 def _parse_integer(given: str, lowest: int, highest: int, what: str, hint: str) -> int:
     text = given.strip()
-    if not _INTEGER.fullmatch(text) or not lowest <= int(text) <= highest:
+    if not re.fullmatch(_INTEGER, text) or not lowest <= int(text) <= highest:
         raise usage_error(f"cannot use {quoted(given)} as {what}", hint)
     return int(text)
 

@@ -62,7 +62,7 @@ _MAX_TEXT = 1000
 _MAX_NUMBER = 2**63 - 1
 _MAX_TIME = 253_370_764_800_000_000
 """The year 9999, CLOCK_REALTIME in µs: the last year that a date can have."""
-_VERSION = re.compile(r"[0-9][0-9A-Za-z.+~-]{0,39}", re.ASCII)
+_VERSION = r"[0-9][0-9A-Za-z.+~-]{0,39}"
 _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
 
 
@@ -240,7 +240,7 @@ def _machine(raw: Mapping[str, Any]) -> str:
 
 def _version(raw: Mapping[str, Any]) -> str:
     text = _text(raw, "version")
-    if text and not _VERSION.fullmatch(text):
+    if text and not re.fullmatch(_VERSION, text):
         raise _Wrong("its version is none")
     return text
 

@@ -111,7 +111,7 @@ def _parse_id(node_id: object, place: int, source: str) -> str:
         hint = f'in quotes it is text: id: "{node_id}"'
         raise refusal(source, f"the id of {what} is {described(node_id)}", hint)
     hint = ""
-    if not NODE_ID.fullmatch(node_id):
+    if not re.fullmatch(NODE_ID, node_id):
         hint = "an id is letters, digits, '_', '-' and '.', and begins with no '.'"
     elif node_id in _RESERVED_IDS:
         hint = "'dora' stands for dora's own sources, such as dora/timer"
@@ -200,13 +200,13 @@ def described(value: object) -> str:
 
 
 _BLANKS = " \t\n"
-_GAP = re.compile(r"(?:[ \t\n]|#[^\n]*)*")
+_GAP = r"(?:[ \t\n]|#[^\n]*)*"
 """Between words. A "#" that begins a word begins a comment."""
-_PIECE = re.compile(
-    r"""'(?P<literal>[^']*)'|"(?P<quoted>(?:[^"\\]|\\.)*)"|\\(?P<one>.)|(?P<plain>[^ \t\n'"\\]+)""",
-    re.DOTALL,
+_PIECE = (
+    r"""(?s)'(?P<literal>[^']*)'|"(?P<quoted>(?:[^"\\]|\\.)*)"|"""
+    r"""\\(?P<one>.)|(?P<plain>[^ \t\n'"\\]+)"""
 )
-_ESCAPE = re.compile(r'\\(?:\n|([$`"\\]))')
+_ESCAPE = r'\\(?:\n|([$`"\\]))'
 """Escapes in double quotes; before any other character a backslash is literal."""
 
 
@@ -227,7 +227,7 @@ def split_arguments(text: str) -> list[str]:
 
 
 def _end_of_gap(text: str, place: int) -> int:
-    match = _GAP.match(text, place)
+    match = re.compile(_GAP).match(text, place)
     return match.end() if match else place
 
 
@@ -235,7 +235,7 @@ def _next_word(text: str, place: int) -> tuple[str, int]:
     """The word that begins at `place`, and where it ends."""
     word = ""
     while place < len(text) and text[place] not in _BLANKS:
-        piece = _PIECE.match(text, place)
+        piece = re.compile(_PIECE).match(text, place)
         if piece is None:
             raise ValueError("a backslash ends it" if text[place] == "\\" else "a quote is open")
         word += _value(piece)
@@ -246,5 +246,5 @@ def _next_word(text: str, place: int) -> tuple[str, int]:
 def _value(piece: re.Match[str]) -> str:
     text = piece[0] if piece.lastgroup is None else piece[piece.lastgroup]
     if piece.lastgroup == "quoted":
-        return _ESCAPE.sub(lambda match: match[1] or "", text)
+        return re.sub(_ESCAPE, lambda match: match[1] or "", text)
     return "" if piece.lastgroup == "one" and text == "\n" else text

@@ -45,7 +45,7 @@ def format_unsets(shell: str, names: Iterable[str] = VARIABLES) -> str:
     return "\n".join(SHELLS[shell][1].format(name) for name in names)
 
 
-_DURATION = re.compile(r"[0-9]{1,9}(ms|s|min)?")
+_DURATION = r"[0-9]{1,9}(ms|s|min)?"
 _DATAFLOW, _GRACE = ("-d", "--dataflow"), ("--grace",)
 _TOLD = {RESTART: "Node `{}` restart initiated", STOP: "Node `{}` stopped"}
 
@@ -83,6 +83,6 @@ def parse_node_command(arguments: Sequence[str]) -> NodeCommand | None:
             return None
         else:
             nodes.append(word)
-    if len(nodes) != 1 or not (grace == "" or _DURATION.fullmatch(grace)):
+    if len(nodes) != 1 or not (grace == "" or re.fullmatch(_DURATION, grace)):
         return None
     return NodeCommand(verb[1], nodes[0], dataflow, parse_duration(grace) if grace else None)

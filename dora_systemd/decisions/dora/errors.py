@@ -9,11 +9,11 @@ from dora_systemd.names import did_you_mean
 from dora_systemd.terminal_text import short_line, without_sequences
 from dora_systemd.values import as_list, as_mapping, quoted, shown
 
-_NUMBERED = re.compile(r"\d+: +")
-_OS_ERROR = re.compile(r"\(os error \d+\)$")
+_NUMBERED = r"\d+: +"
+_OS_ERROR = r"\(os error \d+\)$"
 _END = ("Location:", "Stack backtrace:", "Backtrace omitted", "Run with ")
-_CHOICES = re.compile(r"`([^`]*)`, expected one of ((?:`[^`]*`(?:, )?){6,})")
-_BAD_VALUE = re.compile(r"data did not match any variant of untagged enum EnvValue")
+_CHOICES = r"`([^`]*)`, expected one of ((?:`[^`]*`(?:, )?){6,})"
+_BAD_VALUE = r"data did not match any variant of untagged enum EnvValue"
 UNSET = "a value names a variable that is not set"
 UNSET_OR_OTHER = f"{UNSET} (see --env), or is a list or mapping"
 _MAX_LENGTH = 300
@@ -31,7 +31,9 @@ def parse_dora_error(stderr: str) -> str:
     usage = [line for line in lines if line.startswith("error: ")][:1]
     last = [line for line in lines if line][-1:]
     reason = _innermost(_after(lines, "Caused by:")) or " ".join(headline or usage or last)
-    return short_line(_BAD_VALUE.sub(UNSET_OR_OTHER, _CHOICES.sub(_nearest, reason)), _MAX_LENGTH)
+    return short_line(
+        re.sub(_BAD_VALUE, UNSET_OR_OTHER, re.sub(_CHOICES, _nearest, reason)), _MAX_LENGTH
+    )
 
 
 def _nearest(choices: re.Match[str]) -> str:
@@ -57,15 +59,15 @@ def _innermost(causes: list[str]) -> str:
 
     An error of the operating system does not name its object: the cause before it does.
     """
-    starts = [place for place, line in enumerate(causes) if _NUMBERED.match(line)]
+    starts = [place for place, line in enumerate(causes) if re.match(_NUMBERED, line)]
     blocks = [" ".join(causes[begin:end]) for begin, end in pairwise([*starts, len(causes)])]
-    reasons = [_NUMBERED.sub("", block, count=1) for block in blocks] or [" ".join(causes)]
-    return ": ".join(reasons[-2:]) if _OS_ERROR.search(reasons[-1]) else reasons[-1]
+    reasons = [re.sub(_NUMBERED, "", block, count=1) for block in blocks] or [" ".join(causes)]
+    return ": ".join(reasons[-2:]) if re.search(_OS_ERROR, reasons[-1]) else reasons[-1]
 
 
-UNNAMED = re.compile(r"nodes\[(\d+)\]\.inputs: data did not match any variant of untagged enum \w+")
-_SOURCE = re.compile(r"[^/]+/.+")
-_TIMER = re.compile(r"dora/timer/(?:millis|secs|hz)/[0-9]+")
+UNNAMED = r"nodes\[(\d+)\]\.inputs: data did not match any variant of untagged enum \w+"
+_SOURCE = r"[^/]+/.+"
+_TIMER = r"dora/timer/(?:millis|secs|hz)/[0-9]+"
 _LONGEST = 60
 _NUMBERS = ("queue_size", "input_timeout")
 
@@ -75,7 +77,7 @@ def name_input(reason: str, document: Any) -> str:
 
     document: the dataflow file.
     """
-    match = UNNAMED.search(reason)
+    match = re.search(UNNAMED, reason)
     if match is None:
         return reason
     inputs = _inputs(document, int(match[1]))
@@ -98,9 +100,9 @@ def _troubles(value: Any) -> Iterator[str]:
     source = value.get("source") if isinstance(value, Mapping) else value
     if not isinstance(source, str):
         yield "it has no source, such as NODE/OUTPUT"
-    elif source.startswith("dora/timer") and not _TIMER.fullmatch(source):
+    elif source.startswith("dora/timer") and not re.fullmatch(_TIMER, source):
         yield f"{quoted(source)} is not a timer such as dora/timer/millis/50"
-    elif not _SOURCE.fullmatch(source):
+    elif not re.fullmatch(_SOURCE, source):
         yield f"{quoted(source)} is not NODE/OUTPUT"
     for key in _NUMBERS if isinstance(value, Mapping) else ():
         number = value.get(key, 0)

@@ -10,14 +10,12 @@ from dora_systemd.decisions.dora.protocol import NO_NODE, LogRecord, exit_value
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.resources.oom import Oom
 
-_SPAWNED = re.compile(r"spawned node with pid (\d+)")
-_EXITED = re.compile(
-    r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"
-)
-_STALE = re.compile(r"ignoring stale exit from pid (\d+) ")
-_RESTART_LOOP = re.compile(r"not restarting node|max restarts|waiting .* before restart")
-_UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
-_CASCADED = re.compile(r"marking `(.+)` as cascading error caused by `(.+)`")
+_SPAWNED = r"spawned node with pid (\d+)"
+_EXITED = r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"
+_STALE = r"ignoring stale exit from pid (\d+) "
+_RESTART_LOOP = r"not restarting node|max restarts|waiting .* before restart"
+_UNRESPONSIVE = r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing"
+_CASCADED = r"marking `(.+)` as cascading error caused by `(.+)`"
 
 
 def parse_life_event(record: LogRecord, at_us: int) -> life.Event | None:
@@ -37,12 +35,12 @@ def parse_life_event(record: LogRecord, at_us: int) -> life.Event | None:
 def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
     if record.message == "node is ready":
         return life.NodeReady(at_us, record.node)
-    if spawned := _SPAWNED.fullmatch(record.message):
+    if spawned := re.fullmatch(_SPAWNED, record.message):
         return life.NodeSpawned(at_us, record.node, int(spawned[1]))
-    if exited := _EXITED.match(record.message):
+    if exited := re.match(_EXITED, record.message):
         how = exit_value(exited[1], int(exited[2]) if exited[2] else None)
         return life.NodeExited(at_us, record.node, how, exited[3] == "true")
-    if cascaded := _CASCADED.match(record.message):
+    if cascaded := re.match(_CASCADED, record.message):
         return life.NodeCascaded(at_us, cascaded[1], cascaded[2])
     return None
 
@@ -52,18 +50,18 @@ def parse_stale(record: LogRecord) -> int:
 
     Dora reports that right after the exit, which has no pid.
     """
-    stale = _STALE.match(record.message) if record.target == "daemon" else None
+    stale = re.match(_STALE, record.message) if record.target == "daemon" else None
     return int(stale[1]) if stale else 0
 
 
 def precedes_exit(record: LogRecord) -> bool:
     """Whether dora's restart loop prints this, of a process whose exit dora reports after that."""
-    return record.target == "daemon" and _RESTART_LOOP.match(record.message) is not None
+    return record.target == "daemon" and re.match(_RESTART_LOOP, record.message) is not None
 
 
 def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
     """The event of a line printed by the daemon: dora reports hung nodes only there."""
-    match = _UNRESPONSIVE.search(line)
+    match = re.search(_UNRESPONSIVE, line)
     return life.NodeHung(at_us, match[1], match[2]) if match else None
 
 

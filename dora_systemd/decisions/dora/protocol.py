@@ -17,7 +17,7 @@ from dora_systemd.decisions.cell.exits import Exit, ExitKind
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND, as_list, as_mapping
 
-_TOKEN_TEXT = re.compile(r"[0-9A-Za-z._~+/=-]{1,512}")
+_TOKEN_TEXT = r"[0-9A-Za-z._~+/=-]{1,512}"
 """The characters of a token in an HTTP header: RFC 6750, section 2.1."""
 
 
@@ -46,7 +46,7 @@ def parse_coordinator(raw: object) -> Coordinator:
 
 def parse_token(raw: object) -> str:
     """Parse the token of a coordinator. Raises ValueError if it is not valid."""
-    if not isinstance(raw, str) or not _TOKEN_TEXT.fullmatch(raw):
+    if not isinstance(raw, str) or not re.fullmatch(_TOKEN_TEXT, raw):
         raise ValueError("not a token")
     return raw
 
@@ -59,8 +59,8 @@ def _port(raw: object) -> int:
 
 Params = str | Mapping[str, Any]
 
-_BEHIND_ERROR = re.compile(r"\s*(?:Location|Stack backtrace|Suggestion)\b")
-_ENDED_ALREADY = re.compile(r"unknown dataflow\b")
+_BEHIND_ERROR = r"\s*(?:Location|Stack backtrace|Suggestion)\b"
+_ENDED_ALREADY = r"unknown dataflow\b"
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,7 @@ def parse_spawn_failure(reply: Reply) -> str:
 
     A run that dora no longer knows was executed and has ended: its life events report how.
     """
-    return "" if _ENDED_ALREADY.match(reply.error) else first_line(reply.error)
+    return "" if re.match(_ENDED_ALREADY, reply.error) else first_line(reply.error)
 
 
 def _failure(verdict: Any) -> Exit:
@@ -287,5 +287,5 @@ def first_line(text: str) -> str:
     """An error of dora without the location and backtrace after it."""
     # Line by line: nodes can have a coordinator of their own, which sends a million line ends.
     first, *rest = text.split("\n")
-    head = takewhile(lambda line: not _BEHIND_ERROR.match(line), rest)
+    head = takewhile(lambda line: not re.match(_BEHIND_ERROR, line), rest)
     return " ".join(" ".join((first, *head)).split())

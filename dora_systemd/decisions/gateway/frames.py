@@ -35,7 +35,7 @@ NO_ID = "00000000-0000-0000-0000-000000000000"
 LOGS_LIMIT = 15 << 20
 """Bytes of log in one answer: each takes up to 4 characters of a message of at most 64 MiB."""
 _PART = 1 << 16
-_NUL = re.compile(r"(?<!\\)(?:\\\\)*\\u0000")
+_NUL = r"(?<!\\)(?:\\\\)*\\u0000"
 """NUL as JSON escapes it; an escaped backslash in front of the text "u0000" does not match."""
 _MICROSECOND_NS = 1000
 
@@ -106,7 +106,7 @@ def parse_request(text: str | bytes) -> Request | Malformed:
         return Malformed(NO_ID, f"cannot read the request: {error}"[:300])
     if not isinstance(frame, dict) or not isinstance(frame.get("id"), str):
         return Malformed(NO_ID, "cannot read the request: it has no id")
-    if _NUL.search(text):
+    if re.search(_NUL, text):
         # Paths, names and arguments of programs cannot contain NUL: refuse it once, here.
         return Malformed(frame["id"], "cannot read the request: it has a NUL character")
     return _parse_params(frame["id"], frame.get("params"))

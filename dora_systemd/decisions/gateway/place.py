@@ -22,7 +22,7 @@ DIRECTORY_NAME = "dora-systemd-gateway"
 PORT_VARIABLE = "DORA_DAEMON_PORT"
 ADDRESS_VARIABLE = "DORA_COORDINATOR_ADDR"
 
-_PORT = re.compile(r"[0-9]{1,5}")
+_PORT = r"[0-9]{1,5}"
 _LOOPBACK = ("localhost", ADDRESS)
 _REMOTE_HINT = "the gateway is for this machine; from another one: ssh -L PORT:127.0.0.1:PORT HOST"
 
@@ -69,7 +69,7 @@ def port_drop_in(port: int) -> str:
 def _parse(variable: str, text: str) -> int | None:
     if not text:
         return None
-    if not _PORT.fullmatch(text) or not 0 < int(text) < 65536:
+    if not re.fullmatch(_PORT, text) or not 0 < int(text) < 65536:
         message = f"cannot read {variable}: {quoted(text)} is not a port"
         raise usage_error(message, "a port is 1 to 65535")
     return int(text)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from dora_systemd.values import as_mapping
 
 MAX_NAME = 64
-_ILLEGAL = re.compile(r"[^A-Z0-9_]+")
+_ILLEGAL = r"[^A-Z0-9_]+"
 
 Value = str | bytes | int
 
@@ -26,7 +26,7 @@ def legal_name(name: str, prefix: str) -> str:
     prefix: such as DORA_. journald drops fields whose name begins with an underscore, which are its
     own, or with a digit.
     """
-    return (prefix + _ILLEGAL.sub("_", name.upper()))[:MAX_NAME]
+    return (prefix + re.sub(_ILLEGAL, "_", name.upper()))[:MAX_NAME]
 
 
 def encode_entry(fields: Mapping[str, Value]) -> bytes:
@@ -96,14 +96,12 @@ ERR, WARNING, NOTICE, INFO, DEBUG = 3, 4, 5, 6, 7
 PRIORITIES = {"error": ERR, "warn": WARNING, "info": INFO, "debug": DEBUG, "trace": DEBUG}
 PLAIN_PRIORITY = {"stdout": INFO, "stderr": NOTICE}
 
-_ENDS = re.compile(rb"[\r\n]")
-_RETURNS = re.compile(r"\r+")
+_ENDS = rb"[\r\n]"
+_RETURNS = r"\r+"
 _TOO_DEEP = "[nested too deeply]"
-_ANSI = re.compile(r"\x1b\[[0-9;]*m")
-_TRACING = re.compile(
-    r"^(?P<timestamp>\d{4}-\d\d-\d\dT\S+Z)\s+(?P<level>ERROR|WARN)\s+(?P<message>.*)$"
-)
-_TARGET = re.compile(r"(?:^|: )(?P<target>dora_[a-z0-9_]+(?:::[a-z0-9_]+)*): ")
+_ANSI = r"\x1b\[[0-9;]*m"
+_TRACING = r"^(?P<timestamp>\d{4}-\d\d-\d\dT\S+Z)\s+(?P<level>ERROR|WARN)\s+(?P<message>.*)$"
+_TARGET = r"(?:^|: )(?P<target>dora_[a-z0-9_]+(?:::[a-z0-9_]+)*): "
 
 
 class Piece(bytes):
@@ -125,7 +123,7 @@ class LineSplitter:
         """The lines that `data` completes."""
         # A long line arrives in many chunks: do not search the whole buffer after each chunk.
         is_short = len(self.rest) + len(data) <= self.limit
-        if is_short and not _ENDS.search(data) and self.rest[-1:] != b"\r":
+        if is_short and not re.search(_ENDS, data) and self.rest[-1:] != b"\r":
             self.rest += data
             return []
         data = self.rest + data
@@ -239,7 +237,7 @@ def jsonl_fields(line: bytes) -> dict[str, Value]:
     try:
         record = json.loads(line)
         stream, level = _text(str(record["stream"] or "stdout")), str(record["level"])
-        text = _RETURNS.sub("\n", _text(record["msg"]).strip("\r"))
+        text = re.sub(_RETURNS, "\n", _text(record["msg"]).strip("\r"))
         own = _record_fields({**record, "timestamp": record.get("ts"), "message": text})
     except (ValueError, RecursionError, TypeError, KeyError):
         return {"PRIORITY": INFO, "MESSAGE": line}
@@ -279,8 +277,8 @@ def dora_log_fields(line: bytes) -> dict[str, Value] | None:
 
     Their INFO lines contain the descriptor with its `env:` values, which must not be stored.
     """
-    match = _TRACING.match(_ANSI.sub("", line.decode("utf-8", "replace")))
+    match = re.match(_TRACING, re.sub(_ANSI, "", line.decode("utf-8", "replace")))
     if match is None:
         return None
-    target = _TARGET.search(match["message"])
+    target = re.search(_TARGET, match["message"])
     return _record_fields({**match.groupdict(), **(target.groupdict() if target else {})})

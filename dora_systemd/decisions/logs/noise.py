@@ -3,10 +3,10 @@
 import re
 from collections.abc import Collection
 
-_TIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d+)?")
+_TIME = rb"(?:\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d+)?"
 _EXIT_OF_A_NODE = b"node_failure: dora_daemon::"
 """Part of a line of dora's daemon about an end that node-crashed, -ended or -exited reports."""
-_END_OF_NODE = re.compile(r"node_failure: .*\bnode_id=(\S+)")
+_END_OF_NODE = r"node_failure: .*\bnode_id=(\S+)"
 
 
 def is_same(one: bytes, other: bytes) -> bool:
@@ -15,7 +15,7 @@ def is_same(one: bytes, other: bytes) -> bool:
         return True
     if len(one) != len(other) or b":" not in one:
         return False
-    return _TIME.sub(b"", one) == _TIME.sub(b"", other)
+    return re.sub(_TIME, b"", one) == re.sub(_TIME, b"", other)
 
 
 def repeated(text: str, times: int) -> str:
@@ -27,7 +27,7 @@ def repeated(text: str, times: int) -> str:
 
 def is_end_of(text: str, nodes: Collection[str]) -> bool:
     """Return whether a recorded line of dora's daemon reports that one of `nodes` has failed."""
-    match = _END_OF_NODE.search(text) if nodes else None
+    match = re.search(_END_OF_NODE, text) if nodes else None
     return match is not None and match[1] in nodes
 
 

@@ -47,8 +47,8 @@ UNIT_RESOURCES = "ae8f7b866b0347b9af31fe1c80b127c0"
 
 ALL_LINES = "all"
 """The value of --lines for all lines, also with --follow."""
-_BOOT = re.compile(r"all|(?:[0-9a-f]{32})?(?:[+-]?[0-9]+)?")
-_DURATION = re.compile(r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:ms|s|min|m|h|d|w)")
+_BOOT = r"all|(?:[0-9a-f]{32})?(?:[+-]?[0-9]+)?"
+_DURATION = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:ms|s|min|m|h|d|w)"
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,12 @@ def parse_level(text: str) -> str:
 
 def is_boot(text: str) -> bool:
     """Whether it can follow `journalctl --boot`: an id, an offset or both, or "all"."""
-    return bool(text) and _BOOT.fullmatch(text) is not None
+    return bool(text) and re.fullmatch(_BOOT, text) is not None
 
 
 def journal_time(text: str) -> str:
     """A point in time for journalctl; dora's `5m` becomes `-5m`."""
-    return f"-{text}" if _DURATION.fullmatch(text) else text
+    return f"-{text}" if re.fullmatch(_DURATION, text) else text
 
 
 def journal_timestamp(us: int) -> str:

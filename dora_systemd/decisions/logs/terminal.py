@@ -85,7 +85,7 @@ class TerminalLines:
         """Rewrite the lines that `data` completes, except the last record, which may be partial."""
         shown = self._whole.feed(data)
         if not self._want_colors:
-            shown = COLOR_BYTES.sub(b"", shown)
+            shown = re.sub(COLOR_BYTES, b"", shown)
         before, *parts = _PREFIX.sub(self._rewrite, shown).split(_MARK)
         if self._last:
             self._last[-1] += before

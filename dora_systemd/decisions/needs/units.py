@@ -58,7 +58,7 @@ _MOST = 3
 _OF_ALL = ("basic.target", "sysinit.target", "systemd-journald.socket")
 """Units for which systemd lets all services wait during the boot; the slice is one, too."""
 _MOUNT_SUFFIX = ".mount"
-_ESCAPED = re.compile(rb"\\x([0-9a-f]{2})|-")
+_ESCAPED = rb"\\x([0-9a-f]{2})|-"
 
 
 def format_awaited(units: Iterable[str]) -> str:
@@ -94,7 +94,9 @@ def _need_word(unit: str) -> str:
 
 def _unescaped(name: str) -> str:
     """Unescape a path as systemd-escape(1) --unescape --path does."""
-    parts = _ESCAPED.sub(lambda match: bytes.fromhex((match[1] or b"2f").decode()), name.encode())
+    parts = re.sub(
+        _ESCAPED, lambda match: bytes.fromhex((match[1] or b"2f").decode()), name.encode()
+    )
     return f"/{parts.decode(errors='replace').lstrip('/')}"
 
 

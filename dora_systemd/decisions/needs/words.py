@@ -21,8 +21,8 @@ WORDS = (NETWORK, CLOCK, DATAFLOW, UNIT, MOUNT, NET)
 FOREIGN = (DATAFLOW, UNIT, MOUNT)
 """Needs that make systemd start what may be another user's."""
 
-_UNIT_NAME = re.compile(r"[A-Za-z0-9:_.\\@-]{1,240}\.(?:service|socket|target|mount|device|path)")
-_INTERFACE = re.compile(r"[!-~]{1,15}")
+_UNIT_NAME = r"[A-Za-z0-9:_.\\@-]{1,240}\.(?:service|socket|target|mount|device|path)"
+_INTERFACE = r"[!-~]{1,15}"
 """At most IFNAMSIZ bytes with the final zero, as dev_valid_name() of the kernel."""
 _OF_NODES = ("/", NET)
 _HINT = (
@@ -82,7 +82,7 @@ def _parse_name(value: str, text: str) -> str:
 
 
 def _parse_unit(value: str, text: str) -> str:
-    if not _UNIT_NAME.fullmatch(value):
+    if not re.fullmatch(_UNIT_NAME, value):
         raise _refusal(text, "write the whole name of a unit, such as unit:postgresql.service")
     return value
 
@@ -96,7 +96,7 @@ def _parse_path(value: str, text: str) -> str:
 
 
 def _parse_interface(value: str, text: str) -> str:
-    if not _INTERFACE.fullmatch(value) or value in (".", "..") or {*value} & {*"/:%"}:
+    if not re.fullmatch(_INTERFACE, value) or value in (".", "..") or {*value} & {*"/:%"}:
         hint = "write the name of a network interface, such as net:can0: 1 to 15 characters"
         raise _refusal(text, f"{hint}, without blanks, '/', ':' and '%'")
     return value

@@ -12,7 +12,7 @@ from dora_systemd.values import quoted
 Words = tuple[str, ...]
 
 UNIT = "unit:"
-_UNIT_NAME = re.compile(r"[A-Za-z0-9:_.\\-]{1,200}(@[A-Za-z0-9:_.\\-]{0,200})?\.service")
+_UNIT_NAME = r"[A-Za-z0-9:_.\\-]{1,200}(@[A-Za-z0-9:_.\\-]{0,200})?\.service"
 _MOST_BYTES = 64 * 1024
 
 
@@ -45,7 +45,7 @@ def checked_words(words: Sequence[str]) -> Words:
 
 
 def _check_unit(words: Sequence[str], unit: str) -> None:
-    if len(words) > 1 or not _UNIT_NAME.fullmatch(unit):
+    if len(words) > 1 or not re.fullmatch(_UNIT_NAME, unit):
         raise _refusal(" ".join(words), "write unit:NAME.service, or unit:NAME@.service")
     if unit.startswith((UNIT_PREFIX, NOTICE_PREFIX)):
         raise _refusal(words[0], "a failure must not start a unit of dora-systemd")

@@ -22,7 +22,7 @@ Properties = Mapping[str, Property]
 later value of a slot replaces the earlier one or, for lists, is appended. Two slots can have the
 same name on D-Bus: ConditionPathExists and ConditionHost are both Conditions."""
 
-_WORD = re.compile("[a-z][a-z0-9-]*")
+_WORD = "[a-z][a-z0-9-]*"
 _DOUBLE_KEYS = {"TimeoutSec": ("TimeoutStartSec", "TimeoutStopSec")}
 
 _SUPERVISED = "dora-systemd needs it to supervise the dataflow"
@@ -100,7 +100,11 @@ def _parse_newer(key: str, text: str, newer: Newer) -> dict[str, Property]:
         except (ValueError, DoraSystemdError):
             raise _refusal(f"{key} to {quoted(text)}", f"write {kind.expected}") from None
     word = text.strip()
-    if newer.version > TABLE_VERSION and _WORD.fullmatch(word) and not _is_known(f"{key}={word}"):
+    if (
+        newer.version > TABLE_VERSION
+        and re.fullmatch(_WORD, word)
+        and not _is_known(f"{key}={word}")
+    ):
         for name, kind in TABLE[key].choices:
             if kind.is_choice:
                 return {key: Property(name, "s", word)}

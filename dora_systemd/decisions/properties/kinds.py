@@ -23,28 +23,22 @@ from dora_systemd.values import (
     parse_size,
 )
 
-_PART = re.compile(
-    r"""
+_PART = r"""(?sx)
     (?P<blank> [ \t\n\r]+ )
     | " (?P<double> (?: [^"\\] | \\. )* ) "
     | ' (?P<single> (?: [^'\\] | \\. )* ) '
     | (?P<plain> (?: [^"'\\ \t\n\r] | \\. )+ )
     | (?P<unfinished> . )
-    """,
-    re.DOTALL | re.VERBOSE,
-)
-_ESCAPE = re.compile(
-    r"""
+    """
+_ESCAPE = r"""(?sx)
     (?P<bytes> (?: \\[23][0-7]{2} | \\x[89a-fA-F][0-9a-fA-F] )+ )
     | \\ (?P<octal> [0-7]{3} )
     | \\ (?: x([0-9a-fA-F]{2}) | u([0-9a-fA-F]{4}) | U([0-9a-fA-F]{8}) )
     | \\ (?P<letter> . )
-    """,
-    re.DOTALL | re.VERBOSE,
-)
+    """
 _LETTERS = {"a": "\a", "b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t", "v": "\v", "s": " "}
-_PLAIN_WORD = re.compile(r"[A-Za-z0-9_@%=:,./+~^!?*\[\]-]+")
-_NEEDS_ESCAPE = re.compile(r'[\\"\x00-\x1f\x7f]')
+_PLAIN_WORD = r"[A-Za-z0-9_@%=:,./+~^!?*\[\]-]+"
+_NEEDS_ESCAPE = r'[\\"\x00-\x1f\x7f]'
 
 
 def split_words(text: str) -> list[str]:
@@ -54,7 +48,7 @@ def split_words(text: str) -> list[str]:
     """
     words: list[str] = []
     is_inside = False
-    for part in _PART.finditer(text):
+    for part in re.finditer(_PART, text):
         name = part.lastgroup or ""
         if name == "unfinished":
             raise ValueError("a quote is not closed, or a backslash ends it")
@@ -62,7 +56,7 @@ def split_words(text: str) -> list[str]:
             is_inside = False
             continue
         words += [] if is_inside else [""]
-        words[-1] += _ESCAPE.sub(_unescaped, part[name])
+        words[-1] += re.sub(_ESCAPE, _unescaped, part[name])
         is_inside = True
     return words
 
@@ -75,9 +69,9 @@ def escape_specifiers(text: str) -> str:
 def quote_word(text: str) -> str:
     """`text` as one word of a list in a unit file, quoted and escaped if necessary."""
     escaped = escape_specifiers(text)
-    if _PLAIN_WORD.fullmatch(escaped):
+    if re.fullmatch(_PLAIN_WORD, escaped):
         return escaped
-    return '"' + _NEEDS_ESCAPE.sub(_escaped, escaped) + '"'
+    return '"' + re.sub(_NEEDS_ESCAPE, _escaped, escaped) + '"'
 
 
 def _unescaped(match: re.Match[str]) -> str:
@@ -111,10 +105,10 @@ def _escaped(match: re.Match[str]) -> str:
 SCALE = 2**32 - 1
 """100 % in the properties called ...Scale, which are relative to the machine's size."""
 
-_SIGNED = re.compile(r"[-+]?[0-9]{1,20}")
-_DIGITS = re.compile(r"[0-9]{1,19}")
-_PERCENT = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,2})?)%")
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_SIGNED = r"[-+]?[0-9]{1,20}"
+_DIGITS = r"[0-9]{1,19}"
+_PERCENT = r"([0-9]{1,3}(?:\.[0-9]{1,2})?)%"
+_CONTROL = r"[\x00-\x1f\x7f]"
 
 
 class Property(NamedTuple):
@@ -141,7 +135,7 @@ def plain_text(text: str) -> str:
     """`text` without surrounding blanks. Raises ValueError if a unit file cannot contain it."""
     stripped = text.strip()
     # A backslash at the end of a line would continue it.
-    if _CONTROL.search(text) or not is_readable(text) or stripped.endswith("\\"):
+    if re.search(_CONTROL, text) or not is_readable(text) or stripped.endswith("\\"):
         raise ValueError("control characters")
     return stripped
 
@@ -151,7 +145,7 @@ def word_kind(
     words: Mapping[str, Any],
     numbers: Container[int] = (),
     expected: str = "",
-    pattern: re.Pattern[str] = _DIGITS,
+    pattern: str = _DIGITS,
 ) -> PropertyKind:
     """Words for values, the first one of each value in unit files; `numbers` are valid as well.
 
@@ -162,7 +156,7 @@ def word_kind(
         word = text.strip()
         if word in words:
             return words[word]
-        if not pattern.fullmatch(word) or int(word) not in numbers:
+        if not re.fullmatch(pattern, word) or int(word) not in numbers:
             raise ValueError("not a valid word or number")
         return int(word)
 
@@ -211,7 +205,7 @@ def file_kind(mode: str) -> PropertyKind:
 
 def _parse_share(text: str) -> int:
     """A percentage as a part of SCALE, rounded so that steps of 0.01 % convert back exactly."""
-    match = _PERCENT.fullmatch(text.strip())
+    match = re.fullmatch(_PERCENT, text.strip())
     hundredths = round(float(match[1]) * 100) if match else -1
     if not 0 <= hundredths <= 10000:
         raise ValueError("not a percentage")
@@ -224,7 +218,7 @@ def _format_share(value: int) -> str:
 
 def _parse_time(text: str, factor: int) -> int:
     """A bare number as it is, a time span in µs times `factor`."""
-    if _DIGITS.fullmatch(text.strip()):
+    if re.fullmatch(_DIGITS, text.strip()):
         return int(text)
     return min(factor * parse_duration(text), INFINITY)
 

@@ -18,7 +18,7 @@ from dora_systemd.decisions.properties.kinds import (
 
 Condition = tuple[str, bool, bool, str]
 
-_FIELD = re.compile(r"[A-Z0-9][A-Z0-9_]{0,63}=")
+_FIELD = r"[A-Z0-9][A-Z0-9_]{0,63}="
 
 
 def words_kind(
@@ -89,7 +89,7 @@ def _parse_fields(text: str) -> tuple[bytes, ...]:
     """Parse one field as for systemd-run, or several quoted fields as in unit files."""
     field = plain_text(text)
     fields = WORDS.parse(field) if field.startswith('"') else (field,) if field else ()
-    if not all(_FIELD.match(one) for one in fields):
+    if not all(re.match(_FIELD, one) for one in fields):
         raise ValueError("not a field")
     return tuple(one.encode() for one in fields)
 

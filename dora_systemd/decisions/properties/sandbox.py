@@ -58,7 +58,7 @@ _STRICT_FILES = ("ProcSubset=pid", "PrivateIPC=yes")
 
 _TEMPORARY = ("/tmp", "/var/tmp")
 _HOMES = ("/home", "/root", "/run/user")
-_MOUNTABLE = re.compile(r"[^\s\x00-\x1f\x7f\"'\\:]+")
+_MOUNTABLE = r"[^\s\x00-\x1f\x7f\"'\\:]+"
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ def _unmountable(paths: Iterable[str]) -> list[str]:
 
     After the next daemon-reload the unit would lack that mount, or have another one.
     """
-    return [path for path in paths if not _MOUNTABLE.fullmatch(path)]
+    return [path for path in paths if not re.fullmatch(_MOUNTABLE, path)]
 
 
 def _is_below(path: str, places: Iterable[str]) -> bool:

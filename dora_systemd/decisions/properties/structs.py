@@ -41,7 +41,7 @@ Command = tuple[str, tuple[str, ...], tuple[str, ...]]
 MS_REC = 1 << 14
 """The flag of mount(2) that makes a bind mount recursive."""
 
-_RANGE = re.compile("([0-9]{1,9})(?:-([0-9]{1,9}))?")
+_RANGE = "([0-9]{1,9})(?:-([0-9]{1,9}))?"
 _MAX_CPUS = 8192
 _FAMILIES = {4: 2, 6: 10}
 """AF_INET and AF_INET6 of Linux, see address_families(7)."""
@@ -151,7 +151,7 @@ def _parse_cpus(text: str) -> bytes:
     """A set such as "0-3,8" as a bit mask, lowest byte first."""
     mask = 0
     for word in text.replace(",", " ").split():
-        found = _RANGE.fullmatch(word)
+        found = re.fullmatch(_RANGE, word)
         low, high = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
         if not low <= high < _MAX_CPUS:
             raise ValueError("not a set of numbers")

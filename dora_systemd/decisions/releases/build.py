@@ -25,11 +25,11 @@ from dora_systemd.values import INFINITY, SECOND, as_list, as_mapping
 
 _LONGEST = 300
 """Maximum characters of a line of the build in an error or on a terminal."""
-_OF_NODE = re.compile(r"(?P<node>[\w.-]+): +(?P<level>stdout|stderr|[A-Z]+) +(?P<text>\S.*)")
+_OF_NODE = r"(?P<node>[\w.-]+): +(?P<level>stdout|stderr|[A-Z]+) +(?P<text>\S.*)"
 """A line that dora prints: "a: stdout   text", or "a: INFO     running build command"."""
-_FAILED_NODE = re.compile(r"failed to build node `(?P<node>[^`\n]+)`")
+_FAILED_NODE = r"failed to build node `(?P<node>[^`\n]+)`"
 _UV_ERROR = re.compile(r"^(?:error: | +× )", re.MULTILINE)
-_UV_CAUSE = re.compile(r"\n +(?:cause:|Caused by:|[├╰]─▶) *")
+_UV_CAUSE = r"\n +(?:cause:|Caused by:|[├╰]─▶) *"
 _UNATTENDED = {"PIP_NO_INPUT": "1", "GIT_TERMINAL_PROMPT": "0"}
 """Variables that prevent questions, which nobody could answer in a unit."""
 _HOMELESS = {
@@ -193,19 +193,19 @@ def build_environment(
 def shown_line(line: str) -> str:
     """A line of the build as people read it: "NODE: TEXT" of what dora prints for a node."""
     text = without_sequences(line).strip()
-    found = _OF_NODE.fullmatch(text)
+    found = re.fullmatch(_OF_NODE, text)
     return short_line(f"{found['node']}: {found['text']}" if found else text, _LONGEST)
 
 
 def is_output(line: str) -> bool:
     """Whether a build command has printed the line, and not dora itself."""
-    found = _OF_NODE.fullmatch(without_sequences(line).strip())
+    found = re.fullmatch(_OF_NODE, without_sequences(line).strip())
     return found is not None and not found["level"].isupper()
 
 
 def parse_build_error(reason: str, printed: str) -> str:
     """Name the node in a reason that dora gives. printed: the whole output of dora build."""
-    found = _FAILED_NODE.search(without_sequences(printed))
+    found = re.search(_FAILED_NODE, without_sequences(printed))
     return f"node {found['node']}: {reason}" if found and reason else reason
 
 
@@ -214,7 +214,7 @@ def parse_uv_error(printed: str) -> str:
     text = without_sequences(printed)
     *_, begin = (0, *(found.end() for found in _UV_ERROR.finditer(text)))
     error, _, _ = text[begin:].partition("\nhint: ")
-    return short_line(f"uv: {_UV_CAUSE.sub(': ', error)}", _LONGEST) if begin else ""
+    return short_line(f"uv: {re.sub(_UV_CAUSE, ': ', error)}", _LONGEST) if begin else ""
 
 
 _OF_NODES = (

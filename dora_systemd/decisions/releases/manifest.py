@@ -237,14 +237,14 @@ def _text(value: object) -> str:
     return value
 
 
-_REVISION = re.compile(r"[0-9a-f]{4,64}\+?")
+_REVISION = r"[0-9a-f]{4,64}\+?"
 _MOMENT = "%Y%m%dT%H%M%S"
 _MOMENT_LENGTH = 15
 
 
 def is_revision(text: str) -> bool:
     """Whether it is a revision of git in hexadecimal digits, "+" behind it for changed files."""
-    return _REVISION.fullmatch(text) is not None
+    return re.fullmatch(_REVISION, text) is not None
 
 
 def new_id(at_us: int, revision: str, known: frozenset[str]) -> str:

@@ -31,7 +31,7 @@ from dora_systemd.values import as_mapping
 SCHEMA = 1
 MOST_HEAD = 64 * 1024 * 1024
 """Maximum bytes of the first line: 100,000 files have about 20 MB."""
-_DIGEST = re.compile("[0-9a-f]{64}")
+_DIGEST = "[0-9a-f]{64}"
 _MOST_SOURCE = 4096
 
 
@@ -97,7 +97,7 @@ def _check_files(files: Mapping[str, Stored]) -> None:
     for one in found:
         check_found(one)
     check_amount(found)
-    if not all(one.target or _DIGEST.fullmatch(one.digest) for one in files.values()):
+    if not all(one.target or re.fullmatch(_DIGEST, one.digest) for one in files.values()):
         raise _refusal("a file has no digest", "use doractl deploy -H")
     sizes = {one.digest: one.size for one in files.values()}
     if any(one.size < 0 or one.size != sizes[one.digest] for one in files.values()):

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 PROGRAMS = ("dora", "python")
 """The programs whose versions are checked."""
 _MARK = "versions:"
-_VERSION = re.compile(r"[0-9][0-9A-Za-z.+~-]{0,31}")
+_VERSION = r"[0-9][0-9A-Za-z.+~-]{0,31}"
 
 
 def format_versions(versions: Mapping[str, str]) -> str:
@@ -22,4 +22,4 @@ def parse_versions(text: str) -> dict[str, str]:
     """Parse the versions that a check has printed; other text is left out."""
     line = next((line for line in text.splitlines() if line.startswith(_MARK)), "")
     pairs = (word.partition("=")[::2] for word in line.removeprefix(_MARK).split())
-    return {name: one for name, one in pairs if name in PROGRAMS and _VERSION.fullmatch(one)}
+    return {name: one for name, one in pairs if name in PROGRAMS and re.fullmatch(_VERSION, one)}

@@ -10,7 +10,7 @@ WAIT, COPY, CHECK, BUILD = "wait", "copy", "check", "build"
 STOP, START, SOAK, VERDICT, BACK = "stop", "start", "soak", "verdict", "back"
 STAGES = (WAIT, COPY, CHECK, BUILD, STOP, START, SOAK, VERDICT, BACK)
 
-_COUNT = re.compile(r"(\d{1,6})/(\d{1,6}) nodes (ready|running)")
+_COUNT = r"(\d{1,6})/(\d{1,6}) nodes (ready|running)"
 _IN_SECONDS = 600 * SECOND
 """A soak up to this long is shown as "12/30 s"."""
 
@@ -125,7 +125,7 @@ def going_back(release: str, status: str) -> Step:
 
 
 def _count(status: str) -> Amount | None:
-    match = _COUNT.match(status)
+    match = re.match(_COUNT, status)
     return (int(match[1]), int(match[2])) if match else None
 
 

@@ -17,7 +17,7 @@ ALL = "all"
 
 _ADDRESS = r"[0-9A-Fa-f.]*(?::[0-9A-Fa-f.]*){2,}(?:%[A-Za-z0-9_.-]+)?"
 # No host or user begins with a dash: ssh would take it for an option.
-_HOST = re.compile(
+_HOST = (
     r"(?P<user>[A-Za-z0-9_][A-Za-z0-9_.+-]*@)?"
     rf"(?:(?P<address>{_ADDRESS})"
     r"|(?:(?P<name>[A-Za-z0-9_][A-Za-z0-9_.-]*)"
@@ -44,7 +44,7 @@ def parse_host(text: str) -> Host:
 
     Raises DoraSystemdError (USAGE).
     """
-    match = _HOST.fullmatch(text) if len(text) <= _MAX_LENGTH else None
+    match = re.fullmatch(_HOST, text) if len(text) <= _MAX_LENGTH else None
     port = (match and match["port"]) or ""
     if match is None or (port and not 0 < int(port) <= _MAX_PORT):
         hint = "[user@]HOST[:PORT], several with commas, or all"

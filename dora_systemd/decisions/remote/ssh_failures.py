@@ -7,7 +7,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import short_line, without_sequences
 
 SSH_FAILED = 255
-_OF_SSH = re.compile(
+_OF_SSH = (
     rb"(?:Connection to \S+ closed by remote host\.|Timeout, server \S+ not responding\."
     rb"|client_loop: [^\n]*)\r?\n"
 )
@@ -82,7 +82,7 @@ def too_much(host: Host) -> DoraSystemdError:
 
 def is_of_ssh(data: bytes) -> bool:
     """Return whether ssh wrote this about a lost connection, which the error repeats."""
-    return _OF_SSH.fullmatch(data) is not None
+    return re.fullmatch(_OF_SSH, data) is not None
 
 
 def _error(message: str, hint: str) -> DoraSystemdError:

@@ -19,9 +19,9 @@ MONITOR, PODMAN = "conmon", "podman"
 CLIENTS = (PODMAN, "docker", "nerdctl")
 _VERBS = ("run", "start", "compose")
 _MOST_OPTIONS = 8
-_ID = re.compile(r"[0-9a-f]{64}")
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
-_GROUP = re.compile(r"(?:[a-z-]{1,32}-)?([0-9a-f]{64})(?:\.scope)?")
+_ID = r"[0-9a-f]{64}"
+_NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}"
+_GROUP = r"(?:[a-z-]{1,32}-)?([0-9a-f]{64})(?:\.scope)?"
 _SHORT = 12
 MOST_WAIT = 600.0
 """Seconds in which a client may fetch an image before its container begins."""
@@ -83,7 +83,7 @@ def client_of(pid: int, arguments: Sequence[str]) -> Client | None:
     options = dict(reversed([*pairwise(arguments)]))  # the first of each counts
     if program == MONITOR:
         id, name = options.get("-c", ""), options.get("-n", "")
-        return Client(pid, program, id, _name(name)) if _ID.fullmatch(id) else None
+        return Client(pid, program, id, _name(name)) if re.fullmatch(_ID, id) else None
     if program in CLIENTS and {*arguments[1:_MOST_OPTIONS]} & {*_VERBS}:
         joined = (one.removeprefix("--name=") for one in arguments if one.startswith("--name="))
         is_split = "--cgroups=split" in arguments or options.get("--cgroups") == "split"
@@ -93,12 +93,12 @@ def client_of(pid: int, arguments: Sequence[str]) -> Client | None:
 
 
 def _name(text: str) -> str:
-    return text if _NAME.fullmatch(text) else ""
+    return text if re.fullmatch(_NAME, text) else ""
 
 
 def id_of_group(group: str) -> str:
     """The ID of the container whose cgroup this is, or is below; "" for another group."""
-    found = (_GROUP.fullmatch(part) for part in reversed(group.split("/")))
+    found = (re.fullmatch(_GROUP, part) for part in reversed(group.split("/")))
     return next((match[1] for match in found if match), "")
 
 
@@ -111,7 +111,7 @@ def whole_group(group: str) -> str:
     """The outermost cgroup of the container whose cgroup this is, or is below."""
     parts = group.split("/")
     for count, part in enumerate(parts, 1):
-        if _GROUP.fullmatch(part):
+        if re.fullmatch(_GROUP, part):
             return "/".join(parts[:count])
     return group
 

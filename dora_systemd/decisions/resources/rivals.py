@@ -84,9 +84,9 @@ def on_cpus(
     return found[:MOST_RIVALS]
 
 
-_CPU = re.compile(r"CPU(\d+)")
-_LINE = re.compile(r"\s*(\d{1,9}):((?:\s+\d+)+)\s*(.*)")
-_NAMES = re.compile(r"[,\s]+")
+_CPU = r"CPU(\d+)"
+_LINE = r"\s*(\d{1,9}):((?:\s+\d+)+)\s*(.*)"
+_NAMES = r"[,\s]+"
 _MOST_NAMES = 3
 
 
@@ -136,19 +136,19 @@ class Shared(NamedTuple):
 def parse_interrupts(text: str) -> dict[int, Interrupt]:
     """The interrupts of devices in /proc/interrupts, by number."""
     header, _, rest = text.partition("\n")
-    cpus = len(_CPU.findall(header))
+    cpus = len(re.findall(_CPU, header))
     found = (_parse_line(line, cpus) for line in rest.splitlines())
     return {one.number: one for one in found if one}
 
 
 def _parse_line(line: str, cpus: int) -> Interrupt | None:
-    match = _LINE.fullmatch(line)
+    match = re.fullmatch(_LINE, line)
     if match is None:
         return None
     # A number behind the counts belongs to the controller.
     counts = match[2].split()[:cpus]
     # The kernel writes two blanks before the names, and ", " between them.
-    names = [one for one in _NAMES.split(match[3].rpartition("  ")[2]) if one]
+    names = [one for one in re.split(_NAMES, match[3].rpartition("  ")[2]) if one]
     return Interrupt(int(match[1]), tuple(names), sum(map(int, counts)))
 
 

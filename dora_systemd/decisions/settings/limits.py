@@ -15,8 +15,8 @@ from dora_systemd.decisions.settings.rights import check_rights
 from dora_systemd.errors import usage_error
 from dora_systemd.values import quoted
 
-_DEVICE = re.compile(r"(/dev/\S+?|(?:char|block)-\S+?)(?:[: ]([rwm]+))?")
-_REALTIME = re.compile(r"(?:(rr|fifo):)?([0-9]{1,2})")
+_DEVICE = r"(/dev/\S+?|(?:char|block)-\S+?)(?:[: ]([rwm]+))?"
+_REALTIME = r"(?:(rr|fifo):)?([0-9]{1,2})"
 _DEFAULT_ACCESS = "rw"
 
 _EXPECTED = {
@@ -56,7 +56,7 @@ def _limit_setting(key: str, help_text: str) -> Setting[int | None]:
 def _parse_realtime(given: str) -> str:
     """POLICY:PRIORITY, or PRIORITY, see sched(7)."""
     text = given.strip()
-    match = _REALTIME.fullmatch(text)
+    match = re.fullmatch(_REALTIME, text)
     if not match or int(match[2]) == 0:
         hint = "write a priority from 1 to 99, with rr: or fifo: in front of it or without"
         raise usage_error(f"cannot use {quoted(text)} as realtime priority", hint)
@@ -65,7 +65,7 @@ def _parse_realtime(given: str) -> str:
 
 def _parse_device(text: str) -> str:
     """A device as for DeviceAllow=: a path or a group, and the permissions."""
-    match = _DEVICE.fullmatch(text.strip())
+    match = re.fullmatch(_DEVICE, text.strip())
     if not match or not text.isprintable():
         hint = "write a path below /dev, or char-GROUP; :r behind it lets it be read only"
         raise usage_error(f"cannot allow the device {quoted(text)}", hint)

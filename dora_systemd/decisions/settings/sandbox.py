@@ -29,7 +29,7 @@ from dora_systemd.values import quoted, scalar_text
 MOST_OF_CREDENTIALS = 1024 * 1024
 """Maximum bytes of all credentials of a unit together; the limit of systemd."""
 
-_NAME = re.compile(r"(?!\.{1,2}\Z)[!-.0-9;-~]{1,255}")
+_NAME = r"(?!\.{1,2}\Z)[!-.0-9;-~]{1,255}"
 
 
 def parse_credentials(value: Any, base: Base) -> Mapping[str, str]:
@@ -53,7 +53,7 @@ def _parse_one(text: str, base: Base) -> tuple[str, str]:
 
 
 def _pair(name: str, file: Any, base: Base) -> tuple[str, str]:
-    if not _NAME.fullmatch(name):
+    if not re.fullmatch(_NAME, name):
         hint = "a name is ASCII without blanks, '/' and ':', as that of a file"
         raise usage_error(f"cannot name a credential {quoted(name)}", hint)
     path = PATH.parse(file, base)

@@ -32,18 +32,18 @@ BOOT_CHECK = "boot-complete.target"
 
 HEADER = "# Written by doractl(1). To change something: systemctl edit, see dora-systemd(7).\n"
 
-_SECTION = re.compile(r"\[([^\]]+)\]")
+_SECTION = r"\[([^\]]+)\]"
 _BLANKS = " \t\r"
-_COMMENT = re.compile(rf"^[{_BLANKS}]*[#;].*\n?", re.MULTILINE)
-_CONTINUED = re.compile(rf"\\[{_BLANKS}]*(?:\n[{_BLANKS}]*|\Z)")
-_SPECIFIER = re.compile(r"%[a-zA-Z]")
+_COMMENT = rf"(?m)^[{_BLANKS}]*[#;].*\n?"
+_CONTINUED = rf"\\[{_BLANKS}]*(?:\n[{_BLANKS}]*|\Z)"
+_SPECIFIER = r"%[a-zA-Z]"
 _BOOT_CHECK_ORDER = f"Before={BOOT_CHECK}"
 _ORDERS = ("After=default.target", "After=multi-user.target", _BOOT_CHECK_ORDER)
-_MOUNTABLE = re.compile(r"[^\x00-\x1f\x7f\"'\\]+")
+_MOUNTABLE = r"[^\x00-\x1f\x7f\"'\\]+"
 _TRANSIENT = "# This is a transient unit file"
 # A bind mount as systemd 257 writes it into such a file. systemd quotes nothing there, and would
 # itself read other paths from a line with blanks.
-_TRANSIENT_BIND = re.compile(r"(Bind(?:ReadOnly)?Paths)=(-?)(/[^:]*):(/[^:]*):(rbind|norbind)")
+_TRANSIENT_BIND = r"(Bind(?:ReadOnly)?Paths)=(-?)(/[^:]*):(/[^:]*):(rbind|norbind)"
 
 
 def format_sections(sections: Mapping[str, Sequence[str]]) -> str:
@@ -147,7 +147,7 @@ def _properties(text: str) -> dict[str, Property] | None:
         key, _, value = line.partition("=")
         if line in _ORDERS:
             continue
-        if _SPECIFIER.search(value.replace("%%", "")):
+        if re.search(_SPECIFIER, value.replace("%%", "")):
             return None
         try:
             change = parse_line(key, value.replace("%%", "%"))
@@ -169,7 +169,9 @@ def _mounts(options: RunnerOptions) -> list[str]:
     """
     paths = (posixpath.dirname(options.dataflow), options.working_directory)
     clean = dict.fromkeys(posixpath.normpath(path).replace("%", "%%") for path in paths)
-    words = [f'"{path}"' if " " in path else path for path in clean if _MOUNTABLE.fullmatch(path)]
+    words = [
+        f'"{path}"' if " " in path else path for path in clean if re.fullmatch(_MOUNTABLE, path)
+    ]
     return [f"RequiresMountsFor={' '.join(words)}"] if words else []
 
 
@@ -179,7 +181,7 @@ def _sections(texts: Sequence[str]) -> dict[str, list[str]]:
     for text in texts:
         name = ""
         for line in _logical_lines(text):
-            heading = _SECTION.fullmatch(line)
+            heading = re.fullmatch(_SECTION, line)
             if heading:
                 name = heading[1]
             elif name and name != "Install":
@@ -190,7 +192,7 @@ def _sections(texts: Sequence[str]) -> dict[str, list[str]]:
 
 def _quoted_bind(line: str) -> str:
     """The bind mount of a transient unit, quoted so that systemd reads the same paths again."""
-    found = _TRANSIENT_BIND.fullmatch(line.replace("%%", "%"))
+    found = re.fullmatch(_TRANSIENT_BIND, line.replace("%%", "%"))
     if not found:
         return line
     key, optional, source, target, option = found.groups()
@@ -201,6 +203,6 @@ def _quoted_bind(line: str) -> str:
 
 def _logical_lines(text: str) -> list[str]:
     """Lines without comments; a backslash at the end joins the next line."""
-    joined = _CONTINUED.sub(" ", _COMMENT.sub("", text))
+    joined = re.sub(_CONTINUED, " ", re.sub(_COMMENT, "", text))
     # Not splitlines(): only a newline ends a line here.
     return [line for raw in joined.split("\n") if (line := raw.strip(_BLANKS))]

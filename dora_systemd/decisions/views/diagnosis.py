@@ -17,7 +17,7 @@ DORA_PORTS = {
 }
 """Default ports of a coordinator, and the dora versions that use them."""
 
-_CELL = re.compile(r"/dora-[^/]+\.service(/|$)")
+_CELL = r"/dora-[^/]+\.service(/|$)"
 _ENGINES = ("coordinator", "daemon")
 _MAX_COMMAND = 80
 _COUNTS_HUGE_PAGES = "memory_hugetlb_accounting"
@@ -45,7 +45,7 @@ class Process:
     @property
     def is_in_cell(self) -> bool:
         """Whether the process is part of a supervised dataflow, in any manager."""
-        return bool(_CELL.search(self.group))
+        return bool(re.search(_CELL, self.group))
 
     def __str__(self) -> str:
         shown = " ".join(self.command)

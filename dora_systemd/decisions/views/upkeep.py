@@ -7,7 +7,7 @@ from dora_systemd.decisions.cell.core_dumps import keeps_core_dumps
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.values import format_duration
 
-_APPORT = re.compile(r"\|\S*/apport(?:\s|$)")
+_APPORT = r"\|\S*/apport(?:\s|$)"
 _ASSIGNMENT = re.compile(r"^[ \t]*(\w+)[ \t]*=(.*)$", re.M)
 _NONE = ("0", "0K", "0M", "0G", "0B")
 _INSTALL = "as root: apt install systemd-coredump"
@@ -33,7 +33,7 @@ def judge_core_pattern(
         return Finding("core dumps", State.NOTE, text, "coredumpctl on its host")
     if keeps_core_dumps(pattern):
         return _judge_coredump(is_there, config)
-    if _APPORT.match(pattern):
+    if re.match(_APPORT, pattern):
         text = "apport takes the core dumps of nodes, and discards those of programs of no package"
         remedy = f"{_INSTALL}; systemctl disable --now apport"
         return Finding("core dumps", State.NOTE, text, remedy)

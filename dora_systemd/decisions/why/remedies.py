@@ -149,7 +149,7 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
 """Parts of lines of the C library, Python and Rust, the clearest signs first."""
 
 
-_FULL = re.compile(
+_FULL = (
     r"(?:No space left on device|Disk quota exceeded|ENOSPC|EDQUOT)"
     r"(?:[^\n'\"]{0,40}['\"](?P<path>/[^\n'\"]{1,200})['\"])?"
 )
@@ -159,7 +159,7 @@ _FULL = re.compile(
 def known_remedy(lines: Iterable[str], node: str = "the node") -> str:
     """Find the remedy for a node with these last lines, or "" if they match no known error."""
     text = "\n".join(lines)
-    if full := _FULL.search(text):
+    if full := re.search(_FULL, text):
         return _space(full["path"], node)
     return next((help_ for signs, help_ in _SIGNS if any(one in text for one in signs)), "")
 

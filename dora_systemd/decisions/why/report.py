@@ -33,7 +33,7 @@ from dora_systemd.values import SECOND, format_duration, format_rounded_size
 LINES = 20
 """Maximum number of last lines to show."""
 _TIMELINE = 7
-_SIZE = re.compile("[1-9][0-9]{0,18}")
+_SIZE = "[1-9][0-9]{0,18}"
 _TITLE_WIDTH = 10
 _MILLISECOND = 1000
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
@@ -43,7 +43,7 @@ _WAITING = "systemd restarts it automatically; doractl stop {name} prevents that
 _THERE = "doractl -H {host} why {name} shows what machine {machine} has seen"
 _AGAIN = "nothing: dora restarts {node} automatically"
 _AGAIN_FIXED = "dora restarts {node} automatically, and so finds it fixed"
-_HOPELESS = re.compile(r"(SyntaxError|IndentationError|TabError|ModuleNotFoundError|ImportError)\b")
+_HOPELESS = r"(SyntaxError|IndentationError|TabError|ModuleNotFoundError|ImportError)\b"
 """Begins the last line of a Python program that no restart helps."""
 _FIX_RELEASE = "fix {node}, then run: doractl deploy --name {name}"
 _OTHERS = "fix {others} as well; doractl logs {name} --node {other} has its last lines"
@@ -148,7 +148,7 @@ def _of_passing(report: Report) -> list[str]:
     """Return the remedy for a node that dora is about to restart and that ends again and again."""
     verdict = report.verdict
     has_helped = not any(one.node == verdict.node for one in verdict.restarts)
-    if has_helped and not any(_HOPELESS.match(one.text) for one in report.words[-1:]):
+    if has_helped and not any(re.match(_HOPELESS, one.text) for one in report.words[-1:]):
         return [_AGAIN]
     return [remedy_of(verdict).replace(AND_RESTART, ""), _AGAIN_FIXED]
 
@@ -279,7 +279,7 @@ def _memory_words(details: Mapping[str, str]) -> str:
     sizes = [
         f"{key} {format_rounded_size(int(details[key]))}"
         for key in ("peak", "limit", "held")
-        if _SIZE.fullmatch(details.get(key, ""))
+        if re.fullmatch(_SIZE, details.get(key, ""))
     ]
     owner = {"dataflow": " of the dataflow", "machine": "; the machine had no memory left"}
     return ", ".join(sizes) + owner.get(details.get("owner", ""), "") if sizes else ""

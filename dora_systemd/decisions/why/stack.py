@@ -133,8 +133,8 @@ def _frame(language: str, function: str, place: str) -> Frame:
     return Frame(language, cut(name, _MOST_WORD), end)
 
 
-_LENGTH = re.compile("[1-9][0-9]{0,2}")
-_HASH = re.compile("h[0-9a-f]{16}")
+_LENGTH = "[1-9][0-9]{0,2}"
+_HASH = "h[0-9a-f]{16}"
 
 
 def plain_name(symbol: str) -> str:
@@ -142,7 +142,7 @@ def plain_name(symbol: str) -> str:
     is_nested = symbol.startswith("_ZN")
     rest = re.sub("^_Z(L|N[rVK]*)?", "", symbol)
     parts: list[str] = []
-    while symbol.startswith("_Z") and (length := _LENGTH.match(rest)):
+    while symbol.startswith("_Z") and (length := re.match(_LENGTH, rest)):
         begin, end = length.end(), length.end() + int(length[0])
         parts.append(rest[begin:end])
         rest = rest[end:]
@@ -150,7 +150,7 @@ def plain_name(symbol: str) -> str:
             break
     if not parts or (is_nested and not rest.startswith("E")):
         return symbol
-    return "::".join(one for one in parts if not _HASH.fullmatch(one)) or symbol
+    return "::".join(one for one in parts if not re.fullmatch(_HASH, one)) or symbol
 
 
 _FATAL = "Fatal Python error: "

@@ -16,7 +16,7 @@ from dora_systemd.decisions.cell.rights import (
 )
 from dora_systemd.values import format_cpus
 
-_OF_UNITS = re.compile(r"/(dora-|doractl-check-)[^/]+\.service(/|$)")
+_OF_UNITS = r"/(dora-|doractl-check-)[^/]+\.service(/|$)"
 
 
 def launcher_rights(options: RunnerOptions, unit: Path) -> str:
@@ -42,6 +42,6 @@ def check_first(
     Raises DoraSystemdError. group: that of this process, None to read it from the kernel.
     """
     # A dry run of a user is in no unit, and has the rights of that shell.
-    if _OF_UNITS.search(group or cgroup.group_of()):
+    if re.search(_OF_UNITS, group or cgroup.group_of()):
         check_cpus(limits_of(options))
         prove(rights_of(options))

@@ -23,7 +23,7 @@ from typing import Any
 
 PUNCH_HOLE = 3
 """With FALLOC_FL_KEEP_SIZE, see fallocate(2)."""
-DISCARDED = re.compile(rb"Discarding event for input `(\d+)`")
+DISCARDED = rb"Discarding event for input `(\d+)`"
 """What dora prints for each message that its queue has no room for; there is no counter of it."""
 PIPE_SIZE = 1 << 20
 MOST_META = 16 * 1024
@@ -88,7 +88,7 @@ class Drops:
         with suppress(BlockingIOError):
             self._text += os.read(self._reader, PIPE_SIZE)
             *lines, self._text = self._text.split(b"\n")
-            for one in DISCARDED.findall(b"\n".join(lines)):
+            for one in re.findall(DISCARDED, b"\n".join(lines)):
                 self._counts[int(one)] = self._counts.get(int(one), 0) + 1
 
 

@@ -22,7 +22,7 @@ from dora_systemd.trust.paths import user_name
 
 MOST_HOLDERS = 20
 """Maximum number of holders of a dataflow that are shown."""
-_NODE = re.compile(r"/node-([^/]+)")
+_NODE = r"/node-([^/]+)"
 
 Flocks = Mapping[int, Sequence[int]]
 _POLL_SECONDS = 0.2
@@ -76,7 +76,7 @@ def holders_of(scope: Scope, name: str, flocks: Flocks) -> tuple[Holder, ...]:
 
 def _holder(process: LockProcess, name: str, reasons: Mapping[int, str]) -> Holder:
     _, _, group = process.group.partition(f"/{unit_name(name)}")
-    node = _NODE.match(group)
+    node = re.match(_NODE, group)
     user = "" if process.uid < 0 else user_name(process.uid)
     why = reasons.get(process.inner_pid, "")
     return Holder(process.pid, user, process.command, node[1] if node else "", why)

@@ -13,7 +13,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import name_from_unit
 
 _PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
-_NODE = re.compile(r"node (\S+): ")
+_NODE = r"node (\S+): "
 _CLD_EXITED = 1
 """ExecMainCode of a process that exited, see waitid(2)."""
 
@@ -33,7 +33,7 @@ def logs_hint(flag: str, name: str, reason: str) -> str:
     flag: of the scope. reason: of job_reason().
     """
     more = f"doractl {flag} why {name} shows more"
-    found = _NODE.match(reason)
+    found = re.match(_NODE, reason)
     if not found:
         return more
     return f"check logs: doractl {flag} logs {name} --node {found[1]}; {more}"

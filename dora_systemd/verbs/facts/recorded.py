@@ -60,7 +60,7 @@ class _Recorded(NamedTuple):
 
 _WORDS = {"CURRENT": 0, "PREVIOUS": 1}
 """Of --run, in capitals or not; dora's ids of runs have digits."""
-_OFFSET = re.compile("-?0|-[1-9][0-9]{0,3}")
+_OFFSET = "-?0|-[1-9][0-9]{0,3}"
 
 
 def find_query(
@@ -144,7 +144,7 @@ def _no_node(pattern: str, names: Sequence[str], known: Sequence[str]) -> DoraSy
 
 def _runs_before(run: str) -> int | None:
     """Parse an offset of runs before the last, as in `journalctl --boot`; None for an id."""
-    return -int(run) if _OFFSET.fullmatch(run) else _WORDS.get(run.upper())
+    return -int(run) if re.fullmatch(_OFFSET, run) else _WORDS.get(run.upper())
 
 
 def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from dora_systemd.decisions.views.rows import DataflowRow
 
 _SHOWN = 10
-_PATTERN = re.compile(r"[*?\[]")
+_PATTERN = r"[*?\[]"
 OF_SYSTEM = "a dataflow of that name runs in system scope: add --system, or use sudo"
 
 
@@ -203,7 +203,7 @@ def selectors_of(texts: Sequence[str], known: Iterable[Named]) -> list[Selector]
 
 def is_pattern(text: str) -> bool:
     """Whether it is a pattern as in glob(7)."""
-    return _PATTERN.search(text) is not None
+    return re.search(_PATTERN, text) is not None
 
 
 def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]:

@@ -41,7 +41,7 @@ from dora_systemd.verbs.facts.reading import Reading
 _SAMPLE_SECONDS = 0.3
 _MOST_BUSY = 10
 """Processes whose threads are read."""
-_NODE = re.compile(r"/dora-([^/]+)\.service/node-([^/]+)")
+_NODE = r"/dora-([^/]+)\.service/node-([^/]+)"
 
 Delays = Mapping[str, int]
 Sleep = Callable[[float], None]
@@ -123,7 +123,7 @@ class _Sample:
 
 def _with_node(rival: Rival, proc: Path) -> Rival:
     """The rival with the node that it belongs to."""
-    match = _NODE.search(process_group(rival.pid, proc))
+    match = re.search(_NODE, process_group(rival.pid, proc))
     return rival._replace(node=f"{match[2]} of {match[1]}") if match else rival
 
 

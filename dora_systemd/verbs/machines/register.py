@@ -36,8 +36,8 @@ from dora_systemd.verbs.version import own_facts
 ORIGINAL = "SSH_ORIGINAL_COMMAND"
 _SHELL = 5
 """The words before the mark, see remote_command(): exec sh -c SCRIPT doractl."""
-_PUBLIC = re.compile(r"ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+")
-_MARK = re.compile(r"[a-z]+-[0-9a-f]{32}")
+_PUBLIC = r"ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+"
+_MARK = r"[a-z]+-[0-9a-f]{32}"
 
 
 def authorized_line(program: str, public: str, comment: str) -> str:
@@ -66,7 +66,7 @@ def key_text(public: str) -> str:
 
 def _public(text: str) -> str:
     """The key without its comment."""
-    found = _PUBLIC.match(text)
+    found = re.match(_PUBLIC, text)
     if not found:
         raise bad_input("cannot read the public key", "see ssh-keygen(1)")
     return found[0]
@@ -82,7 +82,7 @@ def forced_words(original: str) -> tuple[str, list[str]]:
     except ValueError as error:
         raise _not_allowed() from error
     mark, *arguments = words[_SHELL:] or [""]
-    if not _MARK.fullmatch(mark) or arguments[:1] != ["member"]:
+    if not re.fullmatch(_MARK, mark) or arguments[:1] != ["member"]:
         raise _not_allowed()
     return mark, arguments[1:]
 

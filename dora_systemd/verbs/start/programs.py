@@ -26,8 +26,8 @@ _MACHINES = {3: "i686", 21: "ppc64", 40: "arm", 62: "x86_64", 183: "aarch64", 24
 """e_machine of elf(5), and the word of uname(1)."""
 _ALSO = {"x86_64": ("i686",), "aarch64": ("arm",)}
 """Other machines whose programs the kernel of a machine may execute, too."""
-_INFO = re.compile(r"(\d{1,9}(?:\.\d{1,9}){1,3}[0-9A-Za-z.+]{0,20})\.dist-info")
-_PYTHON = re.compile(r"python3\.\d{1,3}")
+_INFO = r"(\d{1,9}(?:\.\d{1,9}){1,3}[0-9A-Za-z.+]{0,20})\.dist-info"
+_PYTHON = r"python3\.\d{1,3}"
 
 
 def elf_machine(head: bytes) -> str:
@@ -54,13 +54,13 @@ def script_interpreter(head: bytes) -> str:
 
 def python_directories(names: Iterable[str]) -> list[str]:
     """Return the names that can be the directory of a Python, such as python3.13."""
-    return [one for one in names if _PYTHON.fullmatch(one)]
+    return [one for one in names if re.fullmatch(_PYTHON, one)]
 
 
 def wheel_version(names: Iterable[str], wheel: str) -> str:
     """The version of an installed wheel, by the name of its directory; "" if there is none."""
     begin = f"{wheel}-"
-    found = (_INFO.fullmatch(one.removeprefix(begin)) for one in names if one.startswith(begin))
+    found = (re.fullmatch(_INFO, one.removeprefix(begin)) for one in names if one.startswith(begin))
     return next((one[1] for one in found if one), "")
 
 

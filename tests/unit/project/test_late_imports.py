@@ -1,8 +1,12 @@
-"""Imports stand at the top of a module. The ones inside functions pay, and each says why."""
+"""Imports stand at the top of a module. The ones inside functions pay, and each says why.
+
+An import compiles no regular expressions: a start imports more of them than it uses.
+"""
 
 import ast
+from collections.abc import Iterator
 
-from tests.unit.checkout import module_paths, nodes_of
+from tests.unit.checkout import module_paths, nodes_of, tree_of
 
 LATE = {
     "click takes 35 ms: no --version, and no usual list, waits for it": {
@@ -199,6 +203,20 @@ LATE = {
 }
 """By reason and module: what it imports inside functions. Without dora_systemd. for our own."""
 
+COMPILING = {
+    "adapters.host.real_time",
+    "adapters.host.yaml_loader",
+    "decisions.gateway.request",
+    "decisions.logs.terminal",
+    "decisions.machines.member",
+    "decisions.releases.build",
+    "decisions.releases.manifest",
+    "decisions.resources.host",
+    "decisions.views.upkeep",
+    "decisions.why.stack",
+}
+"""Modules that few commands import, which then use the expressions."""
+
 
 def imported(node: ast.AST) -> set[str]:
     """The modules that a statement imports."""
@@ -223,3 +241,17 @@ def test_imports_inside_functions_have_a_reason() -> None:
     allowed = {name: late for group in LATE.values() for name, late in group.items()}
     assert sum(map(len, LATE.values())) == len(allowed), "a module has one reason"
     assert found == allowed
+
+
+def compiled_at_import(name: str) -> Iterator[ast.Call]:
+    """The calls of re.compile() outside functions."""
+    functions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    statements = (one for one in tree_of(name).body if not isinstance(one, functions))
+    for node in (node for one in statements for node in ast.walk(one)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "re.compile":
+            yield node
+
+
+def test_an_import_compiles_no_expression() -> None:
+    # Instead: NAME = r"...", and re.fullmatch(NAME, text), which keeps what it has compiled.
+    assert {name for name in module_paths() if any(compiled_at_import(name))} == COMPILING
