@@ -14,7 +14,6 @@ A node with readers is only removed if it has no launcher of ours.
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from typing import Any
 
 from dora_systemd.adapters.host import notify
@@ -307,6 +306,6 @@ class Recheck:
         role, options = self._role, self._role.options
         _, prepared = check_start(options, role.own(options), self._environment)
         role.check(prepared.dataflow)
-        here = replace(prepared, dataflow=role.here(prepared.dataflow))
+        here = prepared._replace(dataflow=role.here(prepared.dataflow))
         files = Sources(options, self._environment).files(here)
         check_programs(sorted(frozenset().union(*files.values())))

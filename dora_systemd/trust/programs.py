@@ -10,8 +10,8 @@ import os
 import pwd
 import subprocess
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.paths import reached, user_name
@@ -23,8 +23,7 @@ _FIRST_LINE = 256
 """Bytes of the line "#!INTERPRETER" that the kernel reads, see execve(2)."""
 
 
-@dataclass(frozen=True)
-class Account:
+class Account(NamedTuple):
     """The user that a program runs as, with all groups."""
 
     uid: int

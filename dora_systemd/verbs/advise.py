@@ -60,7 +60,7 @@ class Project:
 
     def current(self, own: SettingsFile | None) -> Current:
         """The present settings with this settings file. Raises DoraSystemdError."""
-        files = replace(self.files, beside=own)
+        files = self.files._replace(beside=own)
         settings = settings_of(self.scope, files, self.request)
         path = str(files.path)
         directory = str(files.path.parent)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -177,7 +177,7 @@ def _relayed(scope: Scope, cell: Cell, uid: int, account: Account | None) -> Coo
 
     coordinator = read_coordinator(scope, cell)
     port = open_port(socket_of(scope, cell), {uid, os.getuid()}, lambda: _settle(account))
-    return replace(coordinator, port=port, local_listen_port=None)
+    return coordinator._replace(port=port, local_listen_port=None)
 
 
 def _unit_facts(manager: Manager, cell: Cell) -> tuple[int, bool]:

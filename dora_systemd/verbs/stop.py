@@ -4,8 +4,8 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager, Observer, is_at_rest
 from dora_systemd.adapters.journal.note import note_request
@@ -35,8 +35,7 @@ THAWED = "thawed first, it was frozen"
 Clock = Callable[[], float]
 
 
-@dataclass(frozen=True)
-class Ended:
+class Ended(NamedTuple):
     """A dataflow with a requested stop."""
 
     cell: Cell
@@ -44,8 +43,7 @@ class Ended:
     problem: str = ""  # why it has not
 
 
-@dataclass(frozen=True)
-class _Stop:
+class _Stop(NamedTuple):
     cell: Cell
     deadline: float  # seconds of the monotonic clock
     is_killed: bool
@@ -111,7 +109,7 @@ def stop_within(
                 left.append(one)
             elif not one.is_killed:
                 again = _begin(manager, one.cell, 0, now())
-                left.append(replace(again, was_frozen=one.was_frozen))
+                left.append(again._replace(was_frozen=one.was_frozen))
             else:
                 text = f"cannot stop {one.cell.unit}: it is {state} although it was killed"
                 yield Ended(one.cell, problem=text)

@@ -2,7 +2,6 @@
 
 import os
 import sys
-from dataclasses import replace
 from functools import partial
 
 import click
@@ -85,4 +84,4 @@ def with_last_words(bus: Bus, scope: Scope, outcome: Outcome) -> Outcome:
     if outcome.error is None:
         return outcome
     hint = print_last_words(bus, scope, outcome.subject.uuid, outcome.error)
-    return replace(outcome, hint=hint)
+    return outcome._replace(hint=hint)

@@ -2,9 +2,8 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.adapters.dora.command import refusal_reason, run_dora
 from dora_systemd.adapters.host import files
@@ -25,8 +24,7 @@ from dora_systemd.trust.sight import Sight
 PACKAGE = Path(__file__).parents[2]
 
 
-@dataclass(frozen=True)
-class Prepared:
+class Prepared(NamedTuple):
     """A dataflow that can be started."""
 
     dataflow: Dataflow  # with modules expanded

@@ -7,10 +7,9 @@ import selectors
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from subprocess import Popen
 from threading import Thread
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from dora_systemd.errors import DoraSystemdError, TimedOut
 from dora_systemd.trust.programs import Account, spawn
@@ -25,8 +24,7 @@ OUTPUT_LIMIT = 4 * 1024 * 1024
 _CHUNK = 65536
 
 
-@dataclass(frozen=True)
-class Completed:
+class Completed(NamedTuple):
     """The result of a child: exit status (minus the signal number if killed) and output."""
 
     status: int

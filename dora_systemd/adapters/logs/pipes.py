@@ -15,7 +15,6 @@ import contextlib
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.adapters.logs.held import HeldLines, held_path, read_held
@@ -141,7 +140,7 @@ class LogPipes:
 
     def set_run(self, run_id: str) -> None:
         """Attribute all lines and events to dora's run `run_id` from now on."""
-        self._origin = replace(self._origin, run=run_id)
+        self._origin = self._origin._replace(run=run_id)
         for source in self._sources.values():
             source.renew(run=run_id)
 
@@ -266,7 +265,7 @@ class LogPipes:
 
     def _source(self, node_id: str) -> Source:
         if node_id not in self._sources:
-            self._sources[node_id] = Source(replace(self._origin, node=node_id))
+            self._sources[node_id] = Source(self._origin._replace(node=node_id))
         return self._sources[node_id]
 
     def _pause(self, node_id: str) -> None:

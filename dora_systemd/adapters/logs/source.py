@@ -3,7 +3,7 @@
 import asyncio
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,7 @@ class Source:
 
     def renew(self, **changes: Any) -> None:
         """Change the origin of the node's later lines."""
-        self.origin = replace(self.origin, **changes)
+        self.origin = self.origin._replace(**changes)
         for pipe in self.pipes:
             pipe.encoder = LineEncoder(self.origin, pipe.stream)
 

@@ -6,10 +6,9 @@ as the daemon would. Nodes that dora must start itself stay unchanged.
 
 import shlex
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
@@ -52,8 +51,7 @@ DEFAULT_OPERATOR = "op"
 """dora's id of the operator in a node with a single operator."""
 
 
-@dataclass(frozen=True)
-class LaunchPlan:
+class LaunchPlan(NamedTuple):
     """The values to rewrite the descriptor with."""
 
     options: RunnerOptions
@@ -61,8 +59,8 @@ class LaunchPlan:
     search_path: str  # PATH of the nodes
     exists: Callable[[str], bool]  # whether a file with that absolute path exists
     read: Read  # the content of a file
-    session: BuildSession = field(default_factory=BuildSession)
-    environment: Mapping[str, str] = field(default_factory=dict)  # for variables in `env:`
+    session: BuildSession = BuildSession()
+    environment: Mapping[str, str] = {}  # for variables in `env:`
 
 
 def launch_descriptor(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, Any]:

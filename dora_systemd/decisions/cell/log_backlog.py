@@ -6,8 +6,7 @@ slowed by a full pipe, so the runner freezes it in time.
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 _BOUNDS = {"max_log_size": "16MB", "max_rotated_files": 1}
 """Limits for these log files, which are in the RuntimeDirectory and so in memory."""
@@ -17,8 +16,7 @@ BREATH = 0.02
 """Seconds that a node runs at least between two freezes: it has other work to do."""
 
 
-@dataclass(frozen=True)
-class Marks:
+class Marks(NamedTuple):
     """Thresholds for freezing a node, in bytes that dora wrote and the runner has not read."""
 
     hold: int  # freeze from here on

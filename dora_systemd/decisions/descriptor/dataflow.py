@@ -13,9 +13,8 @@ dora 1.1).
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.decisions.descriptor.json_size import check_json, is_infinite, refusal
 from dora_systemd.decisions.descriptor.nodes import (
@@ -34,15 +33,14 @@ MAX_JSON = 1024 * 1024 - 4096
 _DORA_SOURCES = "dora/"
 
 
-@dataclass(frozen=True)
-class Dataflow:
+class Dataflow(NamedTuple):
     """A descriptor."""
 
     source: str  # the name of its file in messages
     nodes: tuple[Node, ...]
     env: Mapping[str, object]
     exit_when_nodes_finish: bool | None
-    raw: Mapping[str, object] = field(repr=False)  # the complete mapping
+    raw: Mapping[str, object]  # the complete mapping
 
     def node(self, node_id: str) -> Node | None:
         return next((node for node in self.nodes if node.id == node_id), None)
@@ -92,7 +90,7 @@ def _with_kept_output(nodes: Sequence[Node]) -> Iterator[Node]:
     sources = (given.source.split("/", 3) for one in nodes for given in one.inputs)
     read = {(*one[3:],) for one in sources if one[:2] == ["dora", "logs"]}
     for node in nodes:
-        yield replace(node, keeps_output=True) if {(), (node.id,)} & read else node
+        yield node._replace(keeps_output=True) if {(), (node.id,)} & read else node
 
 
 def _check_ids(dataflow: Dataflow) -> None:
@@ -155,14 +153,13 @@ def _reached(start: str, takers: Mapping[str, list[str]]) -> tuple[str, ...]:
     return tuple(waiting[1:])
 
 
-@dataclass(frozen=True)
-class BuildSession:
+class BuildSession(NamedTuple):
     """The results of the last `dora build` for `dora start`, by node id, as absolute paths."""
 
     # where a node runs; for one from git that is its clone
-    directories: Mapping[str, str] = field(default_factory=dict)
+    directories: Mapping[str, str] = {}
     # virtual environments of `dora build --uv`; without --uv they do not exist
-    envs: Mapping[str, str] = field(default_factory=dict)
+    envs: Mapping[str, str] = {}
 
 
 def session_path(dataflow: str) -> PurePath:

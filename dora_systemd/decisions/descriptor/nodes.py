@@ -2,8 +2,8 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import NamedTuple
 
 from dora_systemd.decisions.descriptor.json_size import refusal
 from dora_systemd.names import MAX_NODE_ID, NODE_ID, did_you_mean
@@ -41,16 +41,14 @@ UNEXPANDED = frozenset({NodeKind.MODULE, NodeKind.HUB})
 """Kinds that `dora expand` replaces: their outputs are declared elsewhere."""
 
 
-@dataclass(frozen=True)
-class Input:
+class Input(NamedTuple):
     """One input: its name in errors, and its source: NODE/OUTPUT or one of dora's own."""
 
     name: str
     source: str
 
 
-@dataclass(frozen=True)
-class Node:
+class Node(NamedTuple):
     """One node of a descriptor."""
 
     id: str
@@ -71,7 +69,7 @@ class Node:
     # for `min_log_level`, and for an input from `dora/logs`
     keeps_output: bool
     working_directory: str  # of `deploy:`, or ""
-    raw: Mapping[str, object] = field(repr=False)  # the complete mapping
+    raw: Mapping[str, object]  # the complete mapping
 
 
 def parse_node(node: object, place: int, source: str) -> Node:

@@ -7,10 +7,9 @@ documents some of them. The runner writes and reports the address and token of i
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from itertools import takewhile
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 from dora_systemd.decisions.cell.exits import Exit, ExitKind
@@ -21,8 +20,7 @@ _TOKEN_TEXT = r"[0-9A-Za-z._~+/=-]{1,512}"
 """The characters of a token in an HTTP header: RFC 6750, section 2.1."""
 
 
-@dataclass(frozen=True)
-class Coordinator:
+class Coordinator(NamedTuple):
     """Ports of 127.0.0.1 and a token."""
 
     # port, token: of the coordinator
@@ -33,7 +31,7 @@ class Coordinator:
 
     def raw(self) -> dict[str, Any]:
         """The values for JSON; parse_coordinator reads them."""
-        return asdict(self)
+        return self._asdict()
 
 
 def parse_coordinator(raw: object) -> Coordinator:
@@ -63,8 +61,7 @@ _BEHIND_ERROR = r"\s*(?:Location|Stack backtrace|Suggestion)\b"
 _ENDED_ALREADY = r"unknown dataflow\b"
 
 
-@dataclass(frozen=True)
-class Reply:
+class Reply(NamedTuple):
     """The reply to request `id`."""
 
     id: str
@@ -72,8 +69,7 @@ class Reply:
     error: str  # "" or dora's text
 
 
-@dataclass(frozen=True)
-class LogRecord:
+class LogRecord(NamedTuple):
     """One line of dora's event stream."""
 
     level: str

@@ -4,13 +4,12 @@ units/templates/dora-systemd.catalog explains each MESSAGE_ID to `journalctl -x`
 the two. Never change or reuse a MESSAGE_ID: https://systemd.io/CATALOG
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from dora_systemd.decisions.logs.lines import ERR, INFO, NOTICE, WARNING, Value, legal_name
 
 
-@dataclass(frozen=True)
-class EventKind:
+class EventKind(NamedTuple):
     """One kind of event."""
 
     message_id: str

@@ -10,7 +10,7 @@ https://systemd.io/JOURNAL_NATIVE_PROTOCOL/ and systemd.journal-fields(7).
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from dora_systemd.values import as_mapping
 
@@ -160,8 +160,7 @@ def _steps(line: bytes) -> list[bytes]:
     return [*filter(None, begun), last]
 
 
-@dataclass(frozen=True)
-class Origin:
+class Origin(NamedTuple):
     """The source of lines; `pid` 0 and `run` "" mean not known yet."""
 
     name: str

@@ -7,7 +7,6 @@ file that the head does not have proves nothing: it may be for that machine only
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -44,7 +43,7 @@ def format_other_file(path: str) -> str:
 def own_dataflow(options: RunnerOptions, dataflow: Dataflow) -> Dataflow:
     """The dataflow with this machine's nodes only."""
     own = tuple(node for node in dataflow.nodes if is_here(options, node.id))
-    return replace(dataflow, nodes=own)
+    return dataflow._replace(nodes=own)
 
 
 def with_works(descriptor: Mapping[str, Any], works: Mapping[str, str]) -> dict[str, Any]:

@@ -6,7 +6,6 @@ escapes and specifiers of unit files are those of systemd.syntax(7).
 
 import re
 from collections.abc import Callable, Container, Mapping
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from dora_systemd.names import is_readable
@@ -119,8 +118,7 @@ class Property(NamedTuple):
     value: Any  # as the signature requires: int, bool, str, and sequences for arrays and structs
 
 
-@dataclass(frozen=True)
-class PropertyKind:
+class PropertyKind(NamedTuple):
     """Functions to parse and format the values of a kind."""
 
     signature: str
@@ -179,7 +177,7 @@ def number_kind(signature: str, lowest: int, highest: int) -> PropertyKind:
 
 def choice_kind(*choices: str) -> PropertyKind:
     """Return the kind of some words; with "yes" and "no", all boolean words are valid."""
-    kind = replace(word_kind("s", {choice: choice for choice in choices}), is_choice=True)
+    kind = word_kind("s", {choice: choice for choice in choices})._replace(is_choice=True)
     if not {"yes", "no"} <= {*choices}:
         return kind
 
@@ -187,7 +185,7 @@ def choice_kind(*choices: str) -> PropertyKind:
         word = text.strip()
         return word if word in choices else format_bool(parse_bool(word))
 
-    return replace(kind, parse=parse)
+    return kind._replace(parse=parse)
 
 
 def file_kind(mode: str) -> PropertyKind:
@@ -248,18 +246,15 @@ SHARE = PropertyKind("u", "a percentage such as 50%", _parse_share, _format_shar
 DURATION = PropertyKind(
     "t", "a time span such as 500ms, 10s or 1min 30s, or infinity", parse_duration, format_duration
 )
-NANOSECONDS = replace(
-    COUNT_LIMIT,
+NANOSECONDS = COUNT_LIMIT._replace(
     expected="nanoseconds, or a time span such as 50us",
     parse=lambda text: _parse_time(text, 1000),
 )
-SECONDS = replace(
-    COUNT_LIMIT,
+SECONDS = COUNT_LIMIT._replace(
     expected="a time span such as 30s, or infinity",
     parse=lambda text: _in_seconds(parse_duration(text)),
 )
-MICROSECONDS = replace(
-    DURATION,
+MICROSECONDS = DURATION._replace(
     expected="a time span such as 100ms, or infinity",
     parse=lambda text: _parse_time(text, 1),
 )

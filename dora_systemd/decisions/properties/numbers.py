@@ -3,7 +3,6 @@
 import errno
 import signal
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from dora_systemd.decisions.properties.kinds import PropertyKind, word_kind, word_of
 
@@ -105,7 +104,7 @@ _SIGNAL = word_kind(
     range(1, signal.SIGRTMAX + 1),
     "a signal such as SIGINT",
 )
-SIGNAL = replace(_SIGNAL, parse=lambda text: int(_SIGNAL.parse(text.upper())))
+SIGNAL = _SIGNAL._replace(parse=lambda text: int(_SIGNAL.parse(text.upper())))
 _STATUS = word_kind("i", {"SUCCESS": 0, "FAILURE": 1}, range(256))
 STATUSES = PropertyKind(
     "(aiai)", "exit statuses and signals such as 75 SIGKILL", _parse_statuses, _format_statuses

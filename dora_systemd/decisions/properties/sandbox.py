@@ -13,7 +13,7 @@ be hidden, such as /tmp, it stays accessible.
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from dora_systemd.decisions.properties.assignments import typed, with_assignments
 from dora_systemd.decisions.properties.kinds import Property
@@ -61,8 +61,7 @@ _HOMES = ("/home", "/root", "/run/user")
 _MOUNTABLE = r"[^\s\x00-\x1f\x7f\"'\\:]+"
 
 
-@dataclass(frozen=True)
-class Sandbox:
+class Sandbox(NamedTuple):
     """The options of a sandbox."""
 
     level: str = DEFAULT_LEVEL  # one of LEVELS
@@ -77,7 +76,7 @@ class Sandbox:
     needed: Sequence[str] = ()  # absolute paths to read, such as the project
     writable: Sequence[str] = ()  # paths to write
     # by path of `needed` and `writable`, the part that only root can replace; all without an entry
-    firm: Mapping[str, str] = field(default_factory=dict)
+    firm: Mapping[str, str] = {}
     # the RuntimeDirectory of the unit, the only one that nodes see; "": all are visible
     directory: str = ""
     denied: Sequence[str] = ()  # paths to write that the nodes' user, `user`, must not write

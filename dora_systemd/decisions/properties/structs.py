@@ -15,7 +15,6 @@ member for another. Parsers raise ValueError or DoraSystemdError; assignments.py
 import ipaddress
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 
 from dora_systemd.decisions.properties import kinds
 from dora_systemd.decisions.properties.kinds import (
@@ -212,7 +211,7 @@ BINDS = words_kind(
     "a(ssbt)", "SOURCE[:TARGET[:norbind]] with absolute paths", _parse_bind, _format_bind
 )
 BANDWIDTHS = _device_kind(
-    replace(kinds.COUNT_LIMIT, parse=_bandwidth), "a device and a rate, such as /dev/sda 5M"
+    kinds.COUNT_LIMIT._replace(parse=_bandwidth), "a device and a rate, such as /dev/sda 5M"
 )
 WEIGHTS = _device_kind(kinds.WEIGHT, "a device and a weight, such as /dev/sda 200")
 LATENCIES = _device_kind(kinds.DURATION, "a device and a time, such as /dev/sda 25ms")

@@ -2,10 +2,9 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.decisions.reload.watch_rules import WatchRules
 
@@ -13,8 +12,7 @@ _EDGES = ("inputs", "outputs", "operator", "operators", "ros2")
 """Keys of a node that dora cannot change in place."""
 
 
-@dataclass(frozen=True)
-class NodeSources:
+class NodeSources(NamedTuple):
     """The files of one node."""
 
     # absolute paths of its program and the modules that it imports
@@ -24,11 +22,10 @@ class NodeSources:
     fresh: frozenset[str] = frozenset()  # the files that the node runs in their present version
 
 
-@dataclass(frozen=True)
-class Touched:
+class Touched(NamedTuple):
     """Nodes affected by changed files, each with the first of these files."""
 
-    nodes: Mapping[str, str] = field(default_factory=dict)
+    nodes: Mapping[str, str] = {}
     descriptor: bool = False  # whether the dataflow file itself has changed
 
 
@@ -60,8 +57,7 @@ def _owners(path: str, nodes: Mapping[str, NodeSources]) -> list[str]:
     return [node for node, sources in nodes.items() if name in sources.text] or list(nodes)
 
 
-@dataclass(frozen=True)
-class Difference:
+class Difference(NamedTuple):
     """The differences of a descriptor, as node ids."""
 
     replaced: tuple[str, ...] = ()  # nodes with changes other than inputs and outputs
@@ -131,8 +127,7 @@ class How(Enum):
     ADD = "added"
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """One node, and the reason: the absolute path of a changed file."""
 
     how: How

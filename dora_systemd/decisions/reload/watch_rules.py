@@ -6,10 +6,9 @@ directory config at the top.
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import PurePath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from dora_systemd.errors import usage_error
 from dora_systemd.values import quoted
@@ -39,15 +38,14 @@ ALWAYS_IGNORED = (
 )
 
 
-@dataclass(frozen=True)
-class WatchRules:
+class WatchRules(NamedTuple):
     """The rules of one dataflow."""
 
     root: str  # absolute directory that patterns are relative to
     watched: tuple[str, ...] = DEFAULT_WATCH  # patterns of files
     ignored: tuple[str, ...] = ()  # patterns that take precedence
     # by directory relative to root, lines of .gitignore
-    gitignores: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    gitignores: Mapping[str, tuple[str, ...]] = {}
     files: frozenset[str] = frozenset()  # absolute paths that are always watched
 
     def has(self, path: str) -> bool:

@@ -5,8 +5,8 @@ document.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from dora_systemd.values import format_rounded_size
 
@@ -19,16 +19,14 @@ class Owner(Enum):
     MACHINE = "machine"
 
 
-@dataclass(frozen=True)
-class OomCounts:
+class OomCounts(NamedTuple):
     """Counters of one group, which only increase."""
 
     kills: int = 0  # OOM kills in the group and below it
     refusals: int = 0  # how often the limit of this group itself was the reason
 
 
-@dataclass(frozen=True)
-class Oom:
+class Oom(NamedTuple):
     """The OOM kill of a node. Sizes in bytes."""
 
     owner: Owner

@@ -6,7 +6,7 @@ not flooded.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from dora_systemd.decisions.resources.usage import WHOLE_CELL
 from dora_systemd.values import SECOND, format_rounded_size
@@ -28,8 +28,7 @@ QUIET = 300 * SECOND
 """µs between two reports of the same kind."""
 
 
-@dataclass(frozen=True)
-class Load:
+class Load(NamedTuple):
     """One sample of a group."""
 
     held: int = 0  # bytes that the kernel cannot reclaim
@@ -44,8 +43,7 @@ class Load:
     mapped: int = 0  # bytes of files that processes have mapped
 
 
-@dataclass(frozen=True)
-class Most:
+class Most(NamedTuple):
     """The most that a group has used in any sample, as in Load."""
 
     held: int = 0
@@ -70,8 +68,7 @@ class Most:
         return {key: text for key, text in known.items() if text}
 
 
-@dataclass(frozen=True)
-class Alarm:
+class Alarm(NamedTuple):
     """The state of one alarm."""
 
     # bad, good: consecutive samples
@@ -97,7 +94,7 @@ def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms
             old = after.get((key, event), Alarm())
             new = _counted(old, is_bad, is_good)
             if _is_due(new, event, now_us):
-                new = replace(new, is_on=True, reported_us=now_us)
+                new = new._replace(is_on=True, reported_us=now_us)
                 reports.append(_report(event, key, load))
             after[key, event] = new
     return after, reports
@@ -124,7 +121,7 @@ def _judged(load: Load) -> list[tuple[str, bool, bool]]:
 def _counted(alarm: Alarm, is_bad: bool, is_good: bool) -> Alarm:
     good = alarm.good + 1 if is_good else 0
     is_on = alarm.is_on and good < GOOD_LOOKS
-    return replace(alarm, bad=alarm.bad + 1 if is_bad else 0, good=good, is_on=is_on)
+    return alarm._replace(bad=alarm.bad + 1 if is_bad else 0, good=good, is_on=is_on)
 
 
 def _is_due(alarm: Alarm, event: str, now_us: int) -> bool:

@@ -1,7 +1,7 @@
 """Checks that limits can be enforced: required controllers, and the size of the machine."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from dora_systemd.decisions.cell.limits import BY_KEY, CPUS, LIMITS, NodeLimits
 from dora_systemd.decisions.properties.assignments import Properties
@@ -38,8 +38,7 @@ _STOP_POST_BYTES = 12 * _MEGABYTE
 """What ExecStopPost= of a dataflow takes."""
 
 
-@dataclass(frozen=True)
-class Machine:
+class Machine(NamedTuple):
     """The machine's size: memory in bytes, number of processors, maximum tasks, and online CPUs."""
 
     memory: int

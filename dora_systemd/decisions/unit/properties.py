@@ -5,7 +5,7 @@ Keys are those of unit files; the values have the types of StartTransientUnit.
 
 import signal
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from dora_systemd.decisions.cell.environment import checked_variable, environment_entries
 from dora_systemd.decisions.cell.options import (
@@ -54,16 +54,15 @@ the runner measures itself."""
 _ENDS_OF_ATTACHED = (RunnerExit.OK, RunnerExit.FAILED_AT_STOP)
 
 
-@dataclass(frozen=True)
-class UnitContext:
+class UnitContext(NamedTuple):
     """Values for the unit besides the runner's options."""
 
     python: str  # absolute path of the interpreter that runs dora-systemd itself
     is_user: bool  # whether the unit is one of a user's manager
     user: str | None = None  # User= in system scope; None runs everything as root
     # all of Environment=, see unit_environment
-    environment: Mapping[str, str] = field(default_factory=dict)
-    credentials: Mapping[str, str] = field(default_factory=dict)  # absolute path by name
+    environment: Mapping[str, str] = {}
+    credentials: Mapping[str, str] = {}  # absolute path by name
     sandbox: Sandbox | None = None  # None for no sandbox
     clock: str = ""  # the service that waits for the right time, or ""
     newer: Newer = NOTHING_NEWER  # what judges a --property that the table does not know

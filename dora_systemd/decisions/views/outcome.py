@@ -1,7 +1,6 @@
 """The outcome of a verb for one subject: a line of text, or a JSON object."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -26,8 +25,7 @@ class Thing(NamedTuple):
     uuid: str = ""
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """The result for one dataflow or Thing."""
 
     subject: Subject
@@ -35,7 +33,7 @@ class Outcome:
     problem: str = ""  # "" for success
     is_news: bool = True  # whether anything had to be done
     node: str = ""
-    details: Mapping[str, Any] = field(default_factory=dict)  # what else a program may need, by key
+    details: Mapping[str, Any] = {}  # what else a program may need, by key
     # hint, code: as in DoraSystemdError, of a problem
     hint: str = ""
     code: ExitCode = ExitCode.FAILURE

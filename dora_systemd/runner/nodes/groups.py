@@ -6,7 +6,6 @@ Also notices containers that nodes start outside of their cgroups, for the journ
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
@@ -131,13 +130,13 @@ class Resources:
 def _load(path: Path, key: str, samples: tuple[CpuSample, ...], now: CpuSample) -> Load:
     # Without an earlier sample the time that was used is not known.
     used = cpu_percent(samples, now, key) if samples else 0.0
-    load = replace(read_load(path), cpu=used)
+    load = read_load(path)._replace(cpu=used)
     # A group without a CPU limit is never throttled.
     if not any(now.throttling.get(key, ())):
         return load
     share = limit_of(cgroup.read_usage(path).cpu_max)
     limit = None if share is None else 100 * share / SECOND
-    return replace(load, throttled=throttled_percent(samples, now, key), cpu_limit=limit)
+    return load._replace(throttled=throttled_percent(samples, now, key), cpu_limit=limit)
 
 
 class Hold:

@@ -9,7 +9,6 @@ import contextlib
 import threading
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
 
@@ -292,7 +291,7 @@ class Reloader:
         try:
             await applier.undo(self.current)
         except DoraSystemdError as refused:
-            back = replace(change, prepared=self.current)
+            back = change._replace(prepared=self.current)
             await self._restart(applier.run, back, refused.message)
         again = "the previous version is running again"
         return DoraSystemdError(f"cannot use {self.options.dataflow}: {error}; {again}")

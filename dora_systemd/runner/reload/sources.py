@@ -5,8 +5,8 @@ import json
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
+from typing import NamedTuple
 
 from dora_systemd.adapters.dora.check import refusal_of_dora
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
@@ -82,15 +82,14 @@ def _identities(paths: Iterable[str]) -> dict[str, Identity | None]:
     return {path: identity(path) for path in paths}
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """The meaning of changed files for the running dataflow."""
 
     prepared: Prepared
     steps: tuple[Step, ...] = ()
     whole: str = ""  # why the whole dataflow has to start again, or ""
-    operators: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    files: Mapping[str, frozenset[str]] = field(default_factory=dict)  # of the programs, by node
+    operators: Mapping[str, Mapping[str, str]] = {}
+    files: Mapping[str, frozenset[str]] = {}  # of the programs, by node
 
     def with_node(self, node: str, dataflow: str) -> "Change":
         """The change, with a reload of `node` added if it is missing. Raises DoraSystemdError."""
@@ -103,7 +102,7 @@ class Change:
         steps = [Step(How.OPERATOR, node, file) for name, file in operators.items() if name]
         if not steps:
             steps = [Step(How.SWAP, node, operators.get("", dataflow))]
-        return replace(self, steps=(*self.steps, *steps))
+        return self._replace(steps=(*self.steps, *steps))
 
 
 class Sources:
@@ -158,7 +157,7 @@ class Sources:
 
     def replan(self, current: Prepared) -> Prepared:
         """`current` with these options. Reads no file: it may be in the middle of an edit."""
-        plan = replace(current.plan, options=self._options)
+        plan = current.plan._replace(options=self._options)
         descriptor = launch_descriptor(current.dataflow, plan)
         return Prepared(current.dataflow, plan, descriptor)
 

@@ -22,8 +22,7 @@ old state "running" would satisfy the wait for the new process.
 
 import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.status import RESTART, NodeStatus
 from dora_systemd.decisions.cell.stops import within_of
@@ -57,8 +56,7 @@ def patience(cell: Cell) -> int:
     return min(max(_READY_SECONDS, _STARTS * start), _MOST_SECONDS)
 
 
-@dataclass(frozen=True)
-class Target:
+class Target(NamedTuple):
     """A node whose process has to end."""
 
     node: str

@@ -5,7 +5,6 @@ Nothing is asked of podman or docker: a socket of theirs is its owner's, and as 
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -140,7 +139,7 @@ def _with_left(one: Outcome, left: Sequence[tuple[str, Container]]) -> Outcome:
         return one
     values = [{"node": node, **container.values()} for node, container in left]
     text = f"{one.text}; {format_left(left)}"
-    return replace(one, text=text, details={**one.details, "left": values})
+    return one._replace(text=text, details={**one.details, "left": values})
 
 
 def left_of(containers: Iterable[tuple[str, Container]]) -> list[tuple[str, Container]]:

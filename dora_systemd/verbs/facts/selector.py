@@ -8,9 +8,8 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup.groups import group_path, has_group
@@ -54,8 +53,7 @@ def runs_for_root(names: Iterable[str]) -> bool:
     return False
 
 
-@dataclass(frozen=True)
-class Selector:
+class Selector(NamedTuple):
     """The text that a user has typed: a name, a unit, a UUID, or the beginning of a UUID.
 
     Only meant() decides what a text means. only(), proven(), loaded(), find(), find_present(),

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import Event, Lock, Thread
 from typing import NoReturn, Protocol
 
@@ -191,7 +191,7 @@ def _member_plan(plan: Plan, part: Part) -> Plan:
     options = plan.options.with_value("restart_policy", "no")._replace(
         start_timeout=INFINITY, grace=min(part.grace, plan.options.grace)
     )
-    return replace(plan, options=options)
+    return plan._replace(options=options)
 
 
 def _check_same(part: Part, plan: Plan) -> None:

@@ -194,7 +194,7 @@ def _source(
     if parcel.directory is not None:
         directory = draft.tree / parcel.directory
         flags[WORKING_DIRECTORY.name] = str(directory)
-    start = replace(request.start, dataflow=str(path), name=parcel.name, flags=flags)
+    start = request.start._replace(dataflow=str(path), name=parcel.name, flags=flags)
     files = read_files(start)
     wanted = settings_of(scope, files, start)[USER]
     user = choose_user(scope, wanted, files.place, str(directory))

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
@@ -64,7 +64,7 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
     want_build: what it needs is built in the release. Raises DoraSystemdError.
     """
     path = project_file(request)
-    wanted = replace(request, dataflow=str(path), is_unbuilt=want_build)
+    wanted = request._replace(dataflow=str(path), is_unbuilt=want_build)
     files = read_files(wanted)
     plan, dataflow = make_plan(scope, wanted, files), files.dataflow()
     directory = plan.options.working_directory
@@ -135,8 +135,7 @@ def released(source: Source, request: StartRequest, tree: Path, uuid: str) -> St
         given[VENV.name] = venv
     if user is not None:
         given[USER.name] = user.pw_name
-    return replace(
-        request,
+    return request._replace(
         dataflow=str(tree / source.dataflow),
         name=options.name,
         flags={**request.flags, **given},

@@ -9,10 +9,9 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager, queued_job
 from dora_systemd.adapters.host.unit_files import (
@@ -47,8 +46,7 @@ _HELD = ("Transient", "NFileDescriptorStore")
 _RETRY_SECONDS = 0.02
 
 
-@dataclass(frozen=True)
-class BootUnit:
+class BootUnit(NamedTuple):
     """The unit file of one dataflow, if there is one."""
 
     unit: str

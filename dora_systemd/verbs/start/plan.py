@@ -5,8 +5,7 @@ What dora and the nodes' programs would report is checked in the cell, see adapt
 
 import pwd
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.properties.sandbox import Sandbox
@@ -39,8 +38,7 @@ if TYPE_CHECKING:  # most dataflows run on one machine
     from dora_systemd.decisions.machines.member import Member
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """A checked request."""
 
     scope: Scope
@@ -48,7 +46,7 @@ class Plan:
     settings: Settings
     user: pwd.struct_passwd | None  # for User=, None in user scope
     environment: Mapping[str, str]  # all of Environment=
-    sandbox: Sandbox = field(default_factory=Sandbox)
+    sandbox: Sandbox = Sandbox()
     warnings: tuple[str, ...] = ()  # printed before the start
     notes: tuple[str, ...] = ()  # printed after the start
     members: tuple["Member", ...] = ()  # the other machines, if it runs on several

@@ -8,9 +8,8 @@ unreadable files: the runner reports them at the start.
 import errno
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
@@ -27,8 +26,7 @@ SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
 USER_FILE = Path("dora-systemd/config.yml")
 
 
-@dataclass(frozen=True)
-class SettingsFile:
+class SettingsFile(NamedTuple):
     """A settings file that was read: its content, and its place."""
 
     path: Path
@@ -42,8 +40,7 @@ class SettingsFile:
         return not self.place.changeable
 
 
-@dataclass(frozen=True)
-class Files:
+class Files(NamedTuple):
     """The dataflow file and its settings files, as they were read."""
 
     name: str  # of the dataflow

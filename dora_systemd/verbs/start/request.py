@@ -2,8 +2,8 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.errors import bad_input
@@ -14,14 +14,13 @@ from dora_systemd.values import shown
 DEFAULT_FILE = "dataflow.yml"
 
 
-@dataclass(frozen=True)
-class StartRequest:
+class StartRequest(NamedTuple):
     """A request to start a dataflow."""
 
     dataflow: str
     name: str | None = None
-    flags: Mapping[str, object] = field(default_factory=dict)  # raw, by name of the setting
-    environment: Mapping[str, str] = field(default_factory=dict)  # the caller's variables
+    flags: Mapping[str, object] = {}  # raw, by name of the setting
+    environment: Mapping[str, str] = {}  # the caller's variables
     attached: bool = False  # the dataflow ends with the caller
     uuid: str = ""  # of a dataflow that is started again
     # of `flags`, those that no earlier start has been accepted with, if there is a UUID

@@ -7,9 +7,8 @@ name of the starting process; a later start by name makes its plan from that rec
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request
@@ -33,8 +32,7 @@ _INIT = "1"
 """PID 1 adds LogExtraFields= of a unit to its own records, so the unit's owner writes in them."""
 
 
-@dataclass(frozen=True)
-class Asked:
+class Asked(NamedTuple):
     """A recorded request of a start."""
 
     name: str
@@ -58,8 +56,8 @@ class Asked:
             raise usage_error(f"cannot start {self.name} as {quoted(wanted.name)}", hint)
         given = {key: value for key, value in wanted.flags.items() if is_given(value)}
         flags = {**self.flags, **given}
-        known = replace(wanted, dataflow=self.dataflow, name=self.name, uuid=self.uuid)
-        return replace(known, flags=flags, changed=frozenset(given))
+        known = wanted._replace(dataflow=self.dataflow, name=self.name, uuid=self.uuid)
+        return known._replace(flags=flags, changed=frozenset(given))
 
 
 def means_name(text: str) -> bool:

@@ -4,8 +4,8 @@ The name of a new dataflow has to be free; what an ended one has left is removed
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Beside, Manager, Property, StageObserver
 from dora_systemd.adapters.host.unit_files import read_unit_file, remove_changes, remove_unit_file
@@ -39,8 +39,7 @@ from dora_systemd.verbs.start.start_unit import start_unit
 from dora_systemd.verbs.start.unit import plan_links, plan_properties, systemd_number
 
 
-@dataclass(frozen=True)
-class Claim:
+class Claim(NamedTuple):
     """A dataflow whose name is free."""
 
     plan: Plan
@@ -160,7 +159,7 @@ def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
         return plan
     members = (one.with_uuid(plan.options.uuid, known.uuid) for one in plan.members)
     options = plan.options._replace(uuid=known.uuid)
-    return replace(plan, options=options, members=tuple(members))
+    return plan._replace(options=options, members=tuple(members))
 
 
 def place_unit_file(

@@ -3,9 +3,8 @@
 import select
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import (
     DOWN,
@@ -33,8 +32,7 @@ from dora_systemd.verbs.start.unit import systemd_number
 _POLL_SECONDS = 0.2
 
 
-@dataclass(frozen=True)
-class Started:
+class Started(NamedTuple):
     """A dataflow that has been started."""
 
     uuid: str

@@ -9,9 +9,8 @@ import os
 import pwd
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dora_systemd.adapters.dora.command import find_dora
 from dora_systemd.adapters.host.files import decoded, read_text
@@ -47,8 +46,7 @@ _UV_HOMES = (".local/bin", ".cargo/bin")
 """Where uv installs itself; ssh and sudo have neither on PATH."""
 
 
-@dataclass(frozen=True)
-class Look:
+class Look(NamedTuple):
     """The programs of the nodes, as their user sees them."""
 
     sight: Sight
@@ -141,8 +139,7 @@ class Look:
         return self.settings.source(setting).startswith("/")
 
 
-@dataclass(frozen=True)
-class Where:
+class Where(NamedTuple):
     """Who runs a dataflow, and from where."""
 
     options: RunnerOptions  # with dora, venv and working directory

@@ -3,7 +3,6 @@
 import os
 import pwd
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -262,7 +261,7 @@ def test_an_enabled_dataflow_that_systemd_has_lost(
     plan = make_plan(scope)
     flow = tmp_path / "robot.yml"
     flow.touch()
-    plan = replace(plan, options=plan.options._replace(dataflow=str(flow)))
+    plan = plan._replace(options=plan.options._replace(dataflow=str(flow)))
     place(manager, plan, want_boot=True)
     (finding,) = found(manager, scope).values()
     assert finding.text == "dora-robot.service is enabled and systemd does not know it"

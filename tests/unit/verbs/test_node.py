@@ -4,7 +4,7 @@ import os
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -155,7 +155,7 @@ def test_a_port_of_somebody_else(scope: Scope) -> None:
     """What the runner names is its user's to say: root gives no token to another's port."""
     with socket.create_server(("127.0.0.1", 0)) as other, ExitStack() as held:
         told = Coordinator(other.getsockname()[1], "secret", 4712)
-        held.enter_context(fake_runner(scope.cell_directory("robot"), **asdict(told)))
+        held.enter_context(fake_runner(scope.cell_directory("robot"), **told._asdict()))
         manager = FakeManager()
         manager.add(options())
         (cell,) = read_cells(manager)

@@ -1,7 +1,6 @@
 """The descriptor as dora gets it: every program replaced by the launcher."""
 
 import shlex
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -233,7 +232,7 @@ def test_what_makes_a_missing_program(
     node: dict[str, Any], files: tuple[str, ...], expected: str
 ) -> None:
     with pytest.raises(DoraSystemdError) as caught:
-        launch(node, replace(plan(), exists=files.__contains__))
+        launch(node, plan()._replace(exists=files.__contains__))
     assert str(caught.value.hint).startswith(expected)
 
 

@@ -1,7 +1,6 @@
 """What nodes owe: read from settings, checked against the descriptor, handed to dora."""
 
 import struct
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -104,7 +103,7 @@ def test_the_command_line_has_it_exactly(output: str, within: int, first: int, t
 
 def owing(owed: Owed) -> LaunchPlan:
     made = plan()
-    return replace(made, options=with_owes(made.options, owed))
+    return made._replace(options=with_owes(made.options, owed))
 
 
 def flow(**keys: Any) -> Dataflow:

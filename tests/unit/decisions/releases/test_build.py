@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -196,8 +195,8 @@ def test_a_node_with_other_things_in_the_place_of_operators() -> None:
     for operators in ("x", {"build": "make"}, ["x"], None):
         node = {"id": "a", "path": "a.py", "operators": operators, "operator": "x"}
         dataflow = parse_dataflow({"nodes": [{"id": "b", "path": "b"}]}, "/x.yml")
-        node_of = replace(dataflow.nodes[0], raw=node)
-        assert built_nodes(replace(dataflow, nodes=(node_of,))) == []
+        node_of = dataflow.nodes[0]._replace(raw=node)
+        assert built_nodes(dataflow._replace(nodes=(node_of,))) == []
 
 
 def test_commands_without_a_lock() -> None:

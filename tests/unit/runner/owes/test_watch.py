@@ -3,7 +3,6 @@
 import asyncio
 import struct
 from collections.abc import Callable, Coroutine
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +53,8 @@ class Bench(ReloadBench):
         self.run = Run(self.pump, self.owing, self.pipes, Swapper(self.pump, self.dora))
         options = with_owes(self.options, *(owes or (OWED,)))
         self.python = "/venv/bin/python"
-        plan = replace(self.prepared.plan, options=options)
-        changed = replace(self.prepared, plan=plan)
+        plan = self.prepared.plan._replace(options=options)
+        changed = self.prepared._replace(plan=plan)
         self.tasks = Spawned()
         self.watch = Watch(self.run, changed, self.dora, self.tasks, self.find_python)
         self.group = root / f"node-{PROBE}"

@@ -3,7 +3,6 @@
 import asyncio
 import os
 import socket
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +178,7 @@ def test_too_many_outputs_are_reported(tmp_path: Path) -> None:
 def prepared_with(bench: Bench, text: str) -> Any:
     plan = bench.prepared.plan
     options = plan.options._replace(settings=(SettingText("", "record", text),))
-    return replace(bench.prepared, plan=replace(plan, options=options))
+    return bench.prepared._replace(plan=plan._replace(options=options))
 
 
 def test_doractl_set_changes_what_is_recorded(tmp_path: Path) -> None:

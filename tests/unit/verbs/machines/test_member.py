@@ -73,14 +73,14 @@ def test_an_sshd_that_opens_forwards_to_the_network(tmp_path: Path) -> None:
 
 def test_an_address_that_this_machine_does_not_have(tmp_path: Path) -> None:
     """At a restart another attempt may help: its network may come up late."""
-    start = replace(START, addresses=("192.0.2.1", "127.0.0.1"))
+    start = START._replace(addresses=("192.0.2.1", "127.0.0.1"))
     request = MemberRequest(ScopeIn(False, 0, tmp_path), start, address_seconds=0.0)
     for again in (0, 1):
         part = replace(PART, again=again)
         with pytest.raises(DoraSystemdError, match="no address") as caught:
             start_member(FakeManager(), request, FakeHead(part))
         assert is_passing(caught.value) == bool(again)
-    own = replace(request, start=replace(START, addresses=("127.0.0.1", "192.0.2.1")))
+    own = replace(request, start=START._replace(addresses=("127.0.0.1", "192.0.2.1")))
     with pytest.raises(DoraSystemdError, match=START.dataflow):
         start_member(FakeManager(), own, FakeHead(PART))
 

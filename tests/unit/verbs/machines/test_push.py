@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -83,7 +82,7 @@ def test_what_is_wrong_here_comes_first(
 
 
 def test_one_machine_has_nothing_to_copy(bench: Bench) -> None:
-    bench.plan = replace(bench.plan, members=())
+    bench.plan = bench.plan._replace(members=())
     with pytest.raises(DoraSystemdError, match="run on this machine") as caught:
         bench.push()
     assert caught.value.code is ExitCode.USAGE

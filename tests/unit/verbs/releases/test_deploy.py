@@ -186,7 +186,7 @@ def test_a_full_disk(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_group_of_its_user_may_enter_a_release(has_user: bool, mode: int, bench: Bench) -> None:
     user = pwd.getpwuid(os.geteuid()) if has_user else None
     source = find_source(bench.scope, bench.start(), False)
-    source = replace(source, plan=replace(source.plan, user=user))
+    source = replace(source, plan=source.plan._replace(user=user))
     with locked(bench.store):
         standing = read_standing(bench.manager, bench.scope, UNIT)
         given = bench.scope, source, bench.store, standing, 0, bench.steps.append

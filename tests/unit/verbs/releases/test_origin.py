@@ -1,7 +1,6 @@
 """Root does not believe a copy more than the original, although the copy is root's."""
 
 import stat
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -28,7 +27,7 @@ def test_the_owner_of_the_original_counts(tmp_path: Path) -> None:
         settings_of(SYSTEM, read_files(copy), copy)
     assert caught.value.code is ExitCode.NO_PERMISSION
     roots = hers._replace(uid=0, owners=frozenset({0}))
-    copy = replace(copy, origin=roots)
+    copy = copy._replace(origin=roots)
     settings = settings_of(SYSTEM, read_files(copy), copy)
     assert "root" in settings.values.values()
 

@@ -1,7 +1,5 @@
 """A dry run as root: a unit like the dataflow's, which runs the check and is forgotten."""
 
-from dataclasses import replace
-
 import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -33,7 +31,7 @@ def test_a_failed_check_starts_no_other_unit() -> None:
     manager, plan = PrintingManager(), make_plan()
     manager.units["doranotice@robot.service"] = {"LoadState": "loaded", "ActiveState": "inactive"}
     options = plan.options.with_value("on_failure", ("/bin/tell",))
-    check_plan(lambda: manager, replace(plan, options=options))
+    check_plan(lambda: manager, plan._replace(options=options))
     assert "OnFailure" not in manager.given
 
 

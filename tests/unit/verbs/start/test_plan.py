@@ -4,7 +4,6 @@ import os
 import pwd
 import signal
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -103,8 +102,8 @@ def test_a_flag_without_effect(project: Path) -> None:
     wanted = StartRequest("robot", environment={"PATH": f"{project}/bin"})
     assert make_plan(USER, asked.request(wanted)).options.name == "robot"
     with pytest.raises(DoraSystemdError, match="cannot use --watch without --hot-reload"):
-        make_plan(USER, replace(asked, flags={}).request(replace(wanted, flags=watching)))
-    again = replace(asked, flags={"hot_reload": True}).request(replace(wanted, flags=watching))
+        make_plan(USER, asked._replace(flags={}).request(wanted._replace(flags=watching)))
+    again = asked._replace(flags={"hot_reload": True}).request(wanted._replace(flags=watching))
     assert make_plan(USER, again).options.of_dataflow("watch") == ("*.py",)
 
 
@@ -312,7 +311,7 @@ def test_the_settings_file_of_all_dataflows_that_others_can_write(project: Path)
         require_modest(read)
     assert caught.value.hint.startswith("give --nice on the command line, or set it in /etc/")
     with pytest.raises(DoraSystemdError) as caught:
-        require_modest(replace(read, path=SYSTEM_FILE))
+        require_modest(read._replace(path=SYSTEM_FILE))
     assert caught.value.hint == f"chown root: {SYSTEM_FILE}; chmod go-w {SYSTEM_FILE}"
 
 
@@ -596,4 +595,4 @@ def test_a_part_of_a_dataflow(project: Path) -> None:
     assert (options.placed, options.machine) == (placed, "gpu")
     flags = {"network": "private"}
     with pytest.raises(DoraSystemdError, match="the network is private"):
-        make_plan(USER, replace(request, flags=flags))
+        make_plan(USER, request._replace(flags=flags))

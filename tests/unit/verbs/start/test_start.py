@@ -1,7 +1,6 @@
 """A name that is to be started: free, in use, enabled with the same settings or with others."""
 
 import pwd
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,7 @@ def test_old_links_go_when_the_new_file_is_there(
     manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = make_plan(scope)
-    spread = replace(plan, options=plan.options._replace(placed=(Placed("a", "gpu"),)))
+    spread = plan._replace(options=plan.options._replace(placed=(Placed("a", "gpu"),)))
     place(manager, spread, want_boot=True)
     link = unit_file(manager).with_name("doralink-robot:gpu.service")
     link.write_text("")
@@ -173,7 +172,7 @@ def test_other_settings_replace_on_request(manager: FakeManager, scope: Scope) -
 def test_another_dataflow_has_another_uuid(manager: FakeManager, scope: Scope) -> None:
     place(manager, make_plan(scope), want_boot=True)
     plan = make_plan(scope, uuid=OTHER)
-    plan = replace(plan, options=plan.options._replace(dataflow="/srv/other.yml"))
+    plan = plan._replace(options=plan.options._replace(dataflow="/srv/other.yml"))
     assert place(manager, plan, want_boot=True)
     assert f"--uuid={OTHER}" in unit_file(manager).read_text()
 
@@ -206,14 +205,14 @@ def user(name: str) -> pwd.struct_passwd:
 
 def test_the_unit_file_of_another_user_stays(manager: FakeManager, scope: Scope) -> None:
     """A user chooses the name of a directory, from which comes that of a dataflow."""
-    place(manager, replace(make_plan(scope), user=user("alice")), want_boot=True)
+    place(manager, make_plan(scope)._replace(user=user("alice")), want_boot=True)
     text = unit_file(manager).read_text()
-    plan = replace(make_plan(scope, OTHER), user=user("mallory"))
+    plan = make_plan(scope, OTHER)._replace(user=user("mallory"))
     with pytest.raises(DoraSystemdError) as caught:
         place(manager, plan, want_boot=True)
     assert caught.value.code is ExitCode.NAME_IN_USE
     assert "that name is alice's, and" in caught.value.message
     assert unit_file(manager).read_text() == text
     settings = make_plan(scope, user="mallory").settings
-    assert place(manager, replace(plan, settings=settings), want_boot=True)
+    assert place(manager, plan._replace(settings=settings), want_boot=True)
     assert "User=mallory\n" in unit_file(manager).read_text()
