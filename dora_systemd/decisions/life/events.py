@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar, dataclass_transform
 
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.status import NodeStatus
@@ -10,14 +11,32 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.resources.oom import Oom
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False, eq=False)
 class Event:
     """Base of all events.
 
-    An event without fields of its own inherits from Event, and needs no dataclass decorator.
+    An event without fields of its own inherits from Event, and needs no decorator.
     """
 
     at_us: int  # CLOCK_REALTIME µs at which the runner learned of it
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash(self.at_us)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}{vars(self)}"
+
+
+E = TypeVar("E", bound=Event)
+
+
+@dataclass_transform(eq_default=False, frozen_default=True)
+def _event(kind: type[E]) -> type[E]:
+    """A frozen dataclass without methods of its own: each costs time when the runner starts."""
+    return dataclass(frozen=True, repr=False, eq=False)(kind)
 
 
 class CoordinatorListening(Event):
@@ -28,7 +47,7 @@ class DaemonConnected(Event):
     """The daemon has registered with the coordinator, and the descriptor is expanded."""
 
 
-@dataclass(frozen=True)
+@_event
 class RunStarted(Event):
     """The coordinator has accepted the descriptor."""
 
@@ -39,7 +58,7 @@ class Subscribed(Event):
     """From here on, life events of the run arrive."""
 
 
-@dataclass(frozen=True)
+@_event
 class Refused(Event):
     """The dataflow cannot start or continue."""
 
@@ -47,7 +66,7 @@ class Refused(Event):
     cause: Cause = Cause.REFUSED
 
 
-@dataclass(frozen=True)
+@_event
 class Failed(Event):
     """Code of the runner raised.
 
@@ -58,7 +77,7 @@ class Failed(Event):
     error: str  # the exception as text
 
 
-@dataclass(frozen=True)
+@_event
 class NodeSpawned(Event):
     """dora has executed a node, for the first time or again."""
 
@@ -66,7 +85,7 @@ class NodeSpawned(Event):
     pid: int
 
 
-@dataclass(frozen=True)
+@_event
 class NodeReady(Event):
     """The node has connected to dora."""
 
@@ -77,7 +96,7 @@ class AllReady(Event):
     """dora has opened its start barrier: messages flow."""
 
 
-@dataclass(frozen=True)
+@_event
 class NodeExited(Event):
     """A process of the node has exited."""
 
@@ -89,7 +108,7 @@ class NodeExited(Event):
     is_essential: bool = False  # the dataflow ends if the node fails finally
 
 
-@dataclass(frozen=True)
+@_event
 class NodeCascaded(Event):
     """dora has ended the node because `by` failed before it was ready."""
 
@@ -97,7 +116,7 @@ class NodeCascaded(Event):
     by: str
 
 
-@dataclass(frozen=True)
+@_event
 class NodeHung(Event):
     """dora's health check, or the node's watchdog, ends the node."""
 
@@ -113,7 +132,7 @@ class NodeHung(Event):
         return self.record == "node-watchdog"
 
 
-@dataclass(frozen=True)
+@_event
 class NodeSilent(Event):
     """An output that the node owes has not come."""
 
@@ -124,7 +143,7 @@ class NodeSilent(Event):
     silent: str  # all that is missing of the node
 
 
-@dataclass(frozen=True)
+@_event
 class NodeSpeaks(Event):
     """A missing output has arrived."""
 
@@ -134,7 +153,7 @@ class NodeSpeaks(Event):
     silent: str  # what is still missing of the node, or ""
 
 
-@dataclass(frozen=True)
+@_event
 class NodeLacks(Event):
     """The node must not run: something that it needs is missing."""
 
@@ -142,14 +161,14 @@ class NodeLacks(Event):
     needs: str  # what is missing (human-readable)
 
 
-@dataclass(frozen=True)
+@_event
 class NodeMet(Event):
     """Everything that the node needs exists: its launcher starts the node."""
 
     node: str
 
 
-@dataclass(frozen=True)
+@_event
 class StartTimedOut(Event):
     """Not all nodes were ready within `after` µs."""
 
@@ -160,14 +179,14 @@ class RunFinished(Event):
     """dora reports that all nodes of the run have exited."""
 
 
-@dataclass(frozen=True)
+@_event
 class ResultKnown(Event):
     """dora's results of an ended run."""
 
     results: Mapping[str, Exit] = field(default_factory=dict)  # by node id; empty: unknown
 
 
-@dataclass(frozen=True)
+@_event
 class ChildExited(Event):
     """A child process has exited."""
 
@@ -176,7 +195,7 @@ class ChildExited(Event):
     oom: Oom | None = None  # as in NodeExited
 
 
-@dataclass(frozen=True)
+@_event
 class ConnectionLost(Event):
     """The coordinator has closed a control connection, or `child` does not respond."""
 
@@ -184,7 +203,7 @@ class ConnectionLost(Event):
     reason: str = "the dora coordinator closed the control connection"
 
 
-@dataclass(frozen=True)
+@_event
 class StopAsked(Event):
     """A stop request."""
 
@@ -195,14 +214,14 @@ class StopAnswered(Event):
     """dora's reply to our Stop: every node has ended."""
 
 
-@dataclass(frozen=True)
+@_event
 class NodeOverdue(Event):
     """A node that received its stop has not ended in its time."""
 
     node: str
 
 
-@dataclass(frozen=True)
+@_event
 class NodeExtends(Event):
     """A node that stops sends EXTEND_TIMEOUT_USEC=."""
 
@@ -211,7 +230,7 @@ class NodeExtends(Event):
     passed_us: int  # since the stop began, by CLOCK_MONOTONIC
 
 
-@dataclass(frozen=True)
+@_event
 class NodeAsked(Event):
     """A restart or a stop of one node was requested, and follows."""
 
@@ -221,7 +240,7 @@ class NodeAsked(Event):
     status: NodeStatus | None = None  # the initial status of the next process after a restart
 
 
-@dataclass(frozen=True)
+@_event
 class NodeKept(Event):
     """Dora refuses a request for the node, whose process continues, or has just ended by itself."""
 
@@ -229,7 +248,7 @@ class NodeKept(Event):
     status: NodeStatus  # before the request
 
 
-@dataclass(frozen=True)
+@_event
 class NodeReloading(Event):
     """The runner is about to end the node, and to start another process in its place."""
 
@@ -238,7 +257,7 @@ class NodeReloading(Event):
     status: NodeStatus | None = None
 
 
-@dataclass(frozen=True)
+@_event
 class NodeAdded(Event):
     """The node is new in the descriptor."""
 
@@ -246,14 +265,14 @@ class NodeAdded(Event):
     status: NodeStatus  # its initial status
 
 
-@dataclass(frozen=True)
+@_event
 class NodeRemoved(Event):
     """The node is no longer in the descriptor, and its process has ended."""
 
     node: str
 
 
-@dataclass(frozen=True)
+@_event
 class ReloadNoted(Event):
     """The result of the last reload."""
 
@@ -266,14 +285,14 @@ class ReloadAsked(Event):
     """The dataflow as a whole has to start again."""
 
 
-@dataclass(frozen=True)
+@_event
 class MachinesAwaited(Event):
     """A member is not connected."""
 
     text: str  # which one and why (human-readable)
 
 
-@dataclass(frozen=True)
+@_event
 class MachineJoined(Event):
     """The dora daemon of a member has joined."""
 
@@ -284,7 +303,7 @@ class Gathered(Event):
     """All members have joined."""
 
 
-@dataclass(frozen=True)
+@_event
 class MachineLost(Event):
     """A member does not take part in the run any more."""
 
@@ -296,7 +315,7 @@ class MachineLost(Event):
     is_waiting: bool = False  # its nodes still run, and wait for the head to stop them
 
 
-@dataclass(frozen=True)
+@_event
 class HeadStops(Event):
     """To a member: the head has dora stop all nodes."""
 
@@ -306,7 +325,7 @@ class HeadStops(Event):
     limit: int = 0
 
 
-@dataclass(frozen=True)
+@_event
 class NodeTurn(Event):
     """To a member: in the order of a stop it is the turn of a node there."""
 
@@ -314,7 +333,7 @@ class NodeTurn(Event):
     within: int  # µs until SIGTERM
 
 
-@dataclass(frozen=True)
+@_event
 class HeadLost(Event):
     """To a member: the head is lost, or requests that the member end its nodes without dora."""
 
