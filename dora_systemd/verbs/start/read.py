@@ -59,22 +59,23 @@ class Files(NamedTuple):
 def read_files(request: StartRequest) -> Files:
     """Read what a request names. Raises DoraSystemdError."""
     path, origin, name = path_of(request), request.origin, request_name(request)
-    text = _read(path)
+    text = _read(path, request)
     if origin is None:
         _refuse_release(path)
     beside = read_beside(path, origin)
     return Files(name, path, text, origin or text.place, beside, read_general(request.environment))
 
 
-def _read(path: Path) -> Text:
-    """The dataflow file. Raises DoraSystemdError (BAD_INPUT)."""
+def _read(path: Path, request: StartRequest) -> Text:
+    """The dataflow file, at `path`. Raises DoraSystemdError (BAD_INPUT)."""
     try:
         return read_file(path)
     except DoraSystemdError as error:
-        if path.name != DEFAULT_FILE or exists(path):
+        if exists(path) or not (request.uuid or request.dataflow == DEFAULT_FILE):
             raise
-        # The user may not have named the file.
+        # The user has named a dataflow that ran from this file, or nothing.
         hint = "go to the directory of a dataflow, or name its file"
+        hint = "put the file back, or start another one" if request.uuid else hint
         raise DoraSystemdError(error.message, hint, error.code) from error
 
 

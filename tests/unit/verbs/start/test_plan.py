@@ -66,12 +66,18 @@ def test_a_plain_plan(project: Path) -> None:
     assert plan.environment["PATH"].startswith(f"{project}/bin:")
 
 
-@pytest.mark.parametrize("path", ["dataflow.yml", "./dataflow.yml"])
-def test_no_dataflow_here(project: Path, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_dataflow_here(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(project)
-    with pytest.raises(DoraSystemdError, match=f"{project}/dataflow.yml: there is no") as caught:
-        make_plan(USER, StartRequest(path))
-    assert caught.value.hint == "go to the directory of a dataflow, or name its file"
+    path = f"{project}/dataflow.yml"
+    for request, hint in (
+        (StartRequest("dataflow.yml"), "go to the directory of a dataflow, or name its file"),
+        (StartRequest("./dataflow.yml"), "correct the path"),
+        (StartRequest(path), "correct the path"),
+        (StartRequest(path, "robot", uuid="u"), "put the file back, or start another one"),
+    ):
+        with pytest.raises(DoraSystemdError, match=f"{path}: there is no") as caught:
+            make_plan(USER, request)
+        assert caught.value.hint == hint
     with pytest.raises(DoraSystemdError, match="there is no such file") as caught:
         make_plan(USER, StartRequest("robt.yml"))
     assert caught.value.hint == "correct the path"
