@@ -17,11 +17,10 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import base_of, owes_of, policies_of
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
-    DORA_KEYS,
     HELD_KEYS,
     LATCH_KEYS,
+    POLICY_KEYS,
     RestartPolicy,
-    given_policies,
     restart_of,
 )
 from dora_systemd.decisions.cell.uv import Read, find_lock, uv_project
@@ -175,8 +174,9 @@ def _keys_of_kept(node: str, options: RunnerOptions) -> Mapping[str, Any]:
 
 def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
     """The restart keys of the node: from the settings for it, its own, or the dataflow's."""
-    own, given = policies_of(options).get(node.id), given_policies(options).get(node.id, {})
-    if own and ("policy" in given or node.restart_policy in ("", "never")):
+    own = policies_of(options).get(node.id)
+    given = {key for owner, key, _ in options.settings if owner == node.id}
+    if own and ("restart_policy" in given or node.restart_policy in ("", "never")):
         return own.dora_keys()
     if node.restart_policy:
         return _with_budget(_restart_bounds(node), own, given) if own else _restart_bounds(node)
@@ -195,13 +195,12 @@ def _with_budget(
 ) -> dict[str, Any]:
     """The keys of a node that keeps the policy in the descriptor, with the settings for it.
 
-    given: the fields of `own` that the settings have.
+    given: the keys of the settings for it, which are dora's.
     """
     if not bounds:
         return {}
     keys = own._replace(policy="always").dora_keys()
-    of_settings = [key for field_, key in DORA_KEYS.items() if field_ in given]
-    found = {**bounds, **{key: keys.get(key) for key in of_settings}}
+    found = {**bounds, **{key: keys.get(key) for key in POLICY_KEYS[1:] if key in given}}
     if "max_restarts" not in given:  # that of the descriptor may be large
         found["restart_delay"] = max(found["restart_delay"], DEFAULT.delay / SECOND)
     return {**found, "max_restart_delay": max(found["restart_delay"], found["max_restart_delay"])}

@@ -79,13 +79,6 @@ class RestartPolicy(NamedTuple):
         return self.max_restarts + 1 + (_HAND_STARTS if self.max_restarts < MOST_COUNTED else 0)
 
 
-DORA_KEYS = {
-    "max_restarts": "max_restarts",
-    "window": "restart_window",
-    "delay": "restart_delay",
-    "max_delay": "max_restart_delay",
-}
-"""The keys of dora by the field of a RestartPolicy, without the policy itself."""
 DEFAULT = RestartPolicy()
 
 HELD_SECONDS = 30 * 24 * 3600.0

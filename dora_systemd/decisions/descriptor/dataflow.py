@@ -183,7 +183,6 @@ _NAME = "[A-Za-z_][A-Za-z0-9_]*"
 _SHORT = rf"\$\$|\$(?P<plain>{_NAME})"
 _LONG = rf"\$\{{(?P<name>{_NAME})(?::-(?P<default>[^}}]*))?\}}"
 _REFERENCE = f"{_SHORT}|{_LONG}"
-_WITHOUT_BRACE = _SHORT
 
 _DOLLAR = "$$$$"
 """A "$" that coordinator and daemon have both halved."""
@@ -224,7 +223,7 @@ def expanded(env: Mapping[str, object], environment: Mapping[str, str]) -> dict[
 
     def replaced_in(text: str) -> str:
         whole, rest = _parts(text)
-        return re.sub(_REFERENCE, replaced, whole) + re.sub(_WITHOUT_BRACE, replaced, rest)
+        return re.sub(_REFERENCE, replaced, whole) + re.sub(_SHORT, replaced, rest)
 
     return {
         key: _until_daemon(replaced_in(value)) if isinstance(value, str) else value
@@ -249,7 +248,7 @@ def _texts_in(dataflow: Dataflow) -> Iterator[str]:
 
 def _names_in(text: str, with_default: bool = True) -> Iterator[str]:
     whole, rest = _parts(text)
-    for match in (*re.finditer(_REFERENCE, whole), *re.finditer(_WITHOUT_BRACE, rest)):
+    for match in (*re.finditer(_REFERENCE, whole), *re.finditer(_SHORT, rest)):
         found = match.groupdict()
         name = found["plain"] or found.get("name")
         if name and (with_default or found.get("default") is None):

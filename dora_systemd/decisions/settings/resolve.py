@@ -99,7 +99,7 @@ def resolve_settings(
     passed = tuple(parse_setting(text) for text in texts_of(flags.get(SET) or ()))
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
-    flagged: dict[str, Any] = {}
+    flagged: Nodes = {}
     for setting in table:
         of_flag = [*_from_flag(setting, flags)]
         given = [
@@ -108,8 +108,9 @@ def resolve_settings(
             *of_flag,
         ]
         sources[setting.name], values[setting.name] = _merged(setting, given)
-        flagged[setting.name] = of_flag[0][1] if of_flag else {}
-    return Settings(values, sources, table, passed=passed, flagged_nodes=flagged.get(NODES, {}))
+        if setting.name == NODES and of_flag:
+            flagged = of_flag[0][1]
+    return Settings(values, sources, table, passed=passed, flagged_nodes=flagged)
 
 
 def given_texts(

@@ -105,8 +105,7 @@ class Selector(NamedTuple):
         # A unit of that very name is not ours, and no hint.
         known = sorted({*names}.difference(self.names))
         is_there = is_of_system(self.names)
-        hint = OF_SYSTEM if is_there else ""
-        hint = hint or did_you_mean(self.text, known)
+        hint = OF_SYSTEM if is_there else did_you_mean(self.text, known)
         if not hint and len(self.text) < MIN_PREFIX and is_uuid_prefix(self.text, 1):
             hint = f"the beginning of a UUID must have at least {MIN_PREFIX} characters"
         if not hint and known:

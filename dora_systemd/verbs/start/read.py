@@ -75,7 +75,8 @@ def _read(path: Path, request: StartRequest) -> Text:
             raise
         # The user has named a dataflow that ran from this file, or nothing.
         hint = "go to the directory of a dataflow, or name its file"
-        hint = "put the file back, or start another one" if request.uuid else hint
+        if request.uuid:
+            hint = "put the file back, or start another one"
         raise DoraSystemdError(error.message, hint, error.code) from error
 
 
