@@ -266,12 +266,19 @@ def test_a_failure_leaves_the_last_messages(user: str, flow: Path) -> None:
     shutil.rmtree(file.parent)
     project.write("fail", "")
     wait_for("it has failed", lambda: show(user, "ActiveState") == "failed")
-    bundles = ("bundles", "robot", "-o", "json")
-    (written,) = wait_for("its bundle", lambda: json.loads(doractl(user, *bundles).stdout))
+
+    def written() -> list[dict[str, Any]]:
+        return list(json.loads(doractl(user, "bundles", "robot", "-o", "json").stdout))
+
+    def of_failure() -> list[dict[str, Any]]:
+        """A slow machine has one of the given-up node before that."""
+        return [one for one in written() if one["event"] == "failed"]
+
+    (final,) = wait_for("its bundle", of_failure, 60)
     last = max(int(one) for one in lines(user, "talker") if one.isdigit())
-    assert written["event"] == "failed"
-    assert last - 5 <= recorded(Path(written["file"]))[-1] <= last
-    doractl(user, "bundles", "robot", "--remove", written["bundle"])
+    assert last - 5 <= recorded(Path(final["file"]))[-1] <= last
+    for one in written():
+        doractl(user, "bundles", "robot", "--remove", one["bundle"])
 
 
 @pytest.mark.parametrize("user", USERS)

@@ -87,7 +87,7 @@ def test_the_last_picture_of_a_camera(
     cell.doractl("bundle", cell.name)
     cell.doractl("stop", cell.name)
     (file,) = (STORE / cell.name).iterdir()
-    browser.wait_text(".pictures", f"from the bundle {file.name}", 60)
+    browser.wait_text(".pictures", f"from the bundle {file.name}", 90)
     browser.wait_js(f"({PIXEL}) === '200,30,40,255'")
     assert {one["bundle"] for one in heads(front, uuid)} == {file.name}
     link = "document.querySelector('.pictures a')"

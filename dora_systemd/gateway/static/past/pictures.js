@@ -5,7 +5,7 @@ import { isUp, since } from "../words.js";
 import { address } from "./bundles.js";
 
 const [OFTEN_MS, SELDOM_MS] = [10e3, 60e3];
-// Of the time between two requests the gateway is busy for at most so much.
+// Of the time between two requests the gateway is busy for at most so much, unless it is slow.
 const SHARE = 0.02;
 const MOST_WIDTH = 800;
 const LINE_END = 10;
@@ -85,7 +85,7 @@ export class Pictures {
     } catch {
       // The gateway has gone: what is shown stays.
     }
-    this.pause = (performance.now() - this.askedAt) / SHARE;
+    this.pause = Math.min((performance.now() - this.askedAt) / SHARE, SELDOM_MS);
     this.isBusy = false;
   }
 
