@@ -31,11 +31,13 @@ class Edge(io.TextIOWrapper):
     """A stream that writes text as terminal_text.escaped() shows it."""
 
     reached_as = ""
-    """The -H of the person who reads this on another host, see with_host()."""
+    """The -H of the person who reads this on another host, see with_target()."""
+    scope = ""
+    """--system or --user, if that person has to write it, see with_target()."""
 
     def write(self, text: str) -> int:
         """Write `text` with control characters escaped."""
-        return super().write(escaped(with_host(text, self.reached_as)))
+        return super().write(escaped(with_target(text, self.reached_as, self.scope)))
 
     def write_own(self, text: str) -> None:
         """Write `text` unchanged."""
@@ -69,23 +71,33 @@ def put_in_place() -> None:
     """Replace standard output and error by escaping streams; open those that are closed."""
     _open_closed()
     # Not for the programs that doractl starts.
-    Edge.reached_as = os.environ.pop(REACHED_AS, "")
+    Edge.reached_as, Edge.scope = os.environ.pop(REACHED_AS, ""), ""
     sys.stdout, sys.stderr = _edge(sys.stdout, Edge), _edge(sys.stderr, Messages)
 
 
-def with_host(text: str, host: str) -> str:
-    """The text, in which commands of doractl are for that host; unchanged without one."""
-    if not host or "doractl " not in text:
+def remember_scope(is_user: bool) -> None:
+    """Let commands that are printed from now on have the option of the command line, if needed."""
+    is_default = is_user == (os.getuid() != 0)
+    Edge.scope = "" if is_default else "--user" if is_user else "--system"
+
+
+def with_target(text: str, host: str, scope: str = "") -> str:
+    """The text, in which commands of doractl are for that host and in that scope, if not empty."""
+    if not (host or scope) or "doractl " not in text:
         return text
     verbs = "|".join(VERBS)
-    command = rf"(\bby \S+ \()?\bdoractl ((?:--(?:system|user) )?(?:{verbs})\b)"
+    command = rf"(\bby \S+ \(|\bsudo )?\bdoractl (--(?:system|user) )?((?:{verbs})\b)"
 
     def there(found: re.Match[str]) -> str:
-        by, words = found.groups()
-        if by:  # what a user has called there, as in "stopped by root (doractl stop)", stays
+        before, given, verb = found.groups("")
+        if before.startswith("by "):  # as in "stopped by root (doractl stop)": stays
             return found[0]
+        # With sudo the scope is the system's.
+        words = (given or f"{scope} ".lstrip() * (not before)) + verb
         # What env prints leads to 127.0.0.1 there, so -H refuses env.
-        return f"{found[0]} on {host}" if words.endswith("env") else f"doractl -H {host} {words}"
+        if host and verb == "env":
+            return f"{before}doractl {words} on {host}"
+        return f"{before}doractl {f'-H {host} ' if host else ''}{words}"
 
     return re.sub(command, there, text)
 
@@ -130,7 +142,8 @@ def write_own(stream: TextIO, text: str) -> None:
 
 def write_view(stream: TextIO, text: str) -> None:
     """Write a table or a report, in which nothing but our own colours controls the terminal."""
-    write_own(stream, with_host(text, stream.reached_as) if isinstance(stream, Edge) else text)
+    is_edge = isinstance(stream, Edge)
+    write_own(stream, with_target(text, stream.reached_as, stream.scope) if is_edge else text)
 
 
 def write_exactly(text: str) -> None:

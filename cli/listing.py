@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.edge import write_view
+from dora_systemd.cli.edge import remember_scope, write_view
 from dora_systemd.decisions.views.dataflows import format_dataflows, is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
@@ -87,6 +87,8 @@ def print_dataflows(request: ListRequest) -> int:
     Raises DoraSystemdError: USAGE for options that exclude each other.
     """
     _check(request)
+    if request.is_user is not None:
+        remember_scope(request.is_user)
     scope = scope_of(request.is_user)
     bus = Bus(scope, for_reading=True)
     if request.selector is None or request.is_pattern:

@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 
 import click
 
-from dora_systemd.cli.edge import print_error, print_warning
+from dora_systemd.cli.edge import print_error, print_warning, remember_scope
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope, scope_of
@@ -27,6 +27,7 @@ def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) ->
     del param
     if value is not None:
         ctx.meta[_SCOPE_KEY] = value
+        remember_scope(value)
 
 
 _scope_option = click.option(

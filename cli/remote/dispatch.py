@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from dora_systemd.cli.edge import with_host
+from dora_systemd.cli.edge import with_target
 from dora_systemd.cli.group import SELECTORS, VerbGroup, doractl, run_verb
 from dora_systemd.cli.remote.plan import ROLLOUTS, Plan, check_hosts, plan_of, valued_flags
 from dora_systemd.cli.remote.run import is_terminal, pass_through, run_on_all, run_there
@@ -42,7 +42,7 @@ def run_elsewhere(arguments: list[str]) -> int:
     except DoraSystemdError as error:
         if error.code is not ExitCode.USAGE:
             raise
-        hint = with_host(error.hint, ",".join(given))
+        hint = with_target(error.hint, ",".join(given))
         raise DoraSystemdError(error.message, hint, error.code) from error
 
 

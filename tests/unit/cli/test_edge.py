@@ -1,11 +1,12 @@
 """What doractl prints for somebody who has called it from another machine."""
 
 import io
+import os
 
 import pytest
 
 from dora_systemd.cli import edge, group
-from dora_systemd.cli.edge import Edge, with_host, write_view
+from dora_systemd.cli.edge import Edge, with_target, write_view
 
 
 @pytest.mark.parametrize(
@@ -23,8 +24,37 @@ from dora_systemd.cli.edge import Edge, with_host, write_view
 )
 def test_commands_are_for_the_host_they_are_about(text: str, there: str | None) -> None:
     wanted = there or "hint: run: doractl -H a@b:7 --user restart x; doractl -H a@b:7 list"
-    assert with_host(text, "a@b:7") == wanted
-    assert with_host(text, "") == text
+    assert with_target(text, "a@b:7") == wanted
+    assert with_target(text, "") == text
+
+
+@pytest.mark.parametrize(
+    ("text", "there"),
+    [
+        ("hint: doractl why x; sudo doractl stop x", "doractl --system why x; sudo doractl stop x"),
+        ("doractl --user list", "doractl --user list"),
+        ("stopped by root (doractl stop)", "stopped by root (doractl stop)"),
+        ("see doractl env", "see doractl --system env"),
+    ],
+)
+def test_commands_are_in_the_scope_they_are_about(text: str, there: str) -> None:
+    assert with_target(text, "", "--system").removeprefix("hint: ") == there
+
+
+def test_a_command_in_a_scope_of_another_host() -> None:
+    wanted = "doractl -H a --system why x, doractl -H a --user restart x, doractl --system env on a"
+    text = "doractl why x, doractl --user restart x, doractl env"
+    assert with_target(text, "a", "--system") == wanted
+
+
+@pytest.mark.parametrize("is_user", [True, False])
+def test_a_scope_is_in_commands_unless_it_is_the_default(is_user: bool) -> None:
+    edge.remember_scope(is_user)
+    named = Edge.scope
+    edge.remember_scope(os.getuid() != 0)
+    assert Edge.scope == ""
+    is_default = is_user == (os.getuid() != 0)
+    assert named == ("" if is_default else "--user" if is_user else "--system")
 
 
 def test_all_verbs_are_known() -> None:
