@@ -142,6 +142,11 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
         "start, only a restart of the dataflow finds the new one",
     ),
     (
+        ("can't start new thread", "Resource temporarily unavailable"),
+        "the limit of processes and threads may be reached: doractl set NAME --tasks-limit N, or "
+        "--node NODE:tasks_limit=N, raises it",
+    ),
+    (
         ("Operation not permitted", "Address family not supported", "EPERM"),
         f"the sandbox may have refused that; try --sandbox none, {_MORE}",
     ),

@@ -411,6 +411,8 @@ def test_absolute_paths(tmp_path: Path) -> None:
         ("qt.qpa.xcb: could not connect to display :0", "BindReadOnlyPaths=/tmp/.X11-unix"),
         ("_tkinter.TclError: no display name and no $DISPLAY environment variable", "DISPLAY=:0"),
         ("gtk: Cannot open display: ", "--env DISPLAY=:0"),
+        ("RuntimeError: can't start new thread", "--tasks-limit N"),
+        ("/bin/bash: fork: retry: Resource temporarily unavailable", "NODE:tasks_limit=N"),
     ],
 )
 def test_signs_of_the_sandbox(line: str, words: str) -> None:
