@@ -142,8 +142,9 @@ def write_own(stream: TextIO, text: str) -> None:
 
 def write_view(stream: TextIO, text: str) -> None:
     """Write a table or a report, in which nothing but our own colours controls the terminal."""
-    is_edge = isinstance(stream, Edge)
-    write_own(stream, with_target(text, stream.reached_as, stream.scope) if is_edge else text)
+    if isinstance(stream, Edge):
+        text = with_target(text, stream.reached_as, stream.scope)
+    write_own(stream, text)
 
 
 def write_exactly(text: str) -> None:

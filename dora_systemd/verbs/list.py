@@ -29,7 +29,9 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
     # Imported late: the journal is slow, and what runs does not need it.
     if not wanted.meant(cells) and (row := wanted.ended(scope)):
         from dora_systemd.verbs.facts.ended import with_cause
+        from dora_systemd.verbs.start.restart_ended import recorded_file
 
+        row = row._replace(dataflow=recorded_file(scope, row.name, row.uuid))
         return mark_bundles(scope, mark_enabled(manager, scope, [with_cause(scope, row)]))[0]
     row = read_whole_rows(manager, scope, [wanted.loaded(cells)])[0]
     if is_up_word(row):

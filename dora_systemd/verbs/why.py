@@ -192,7 +192,11 @@ def _with_file(manager: Manager, scope: Scope, uuid: str, name: str) -> tuple[Ce
     cell = read_cell(manager, unit_name(name))
     if cell is not None and cell.uuid == uuid:
         return cell, _subject(scope, cell)
-    return None, Subject(uuid, name, unit_name(name), scope.flag)
+    # Imported late: most dataflows run.
+    from dora_systemd.verbs.start.restart_ended import recorded_file
+
+    file = recorded_file(scope, name, uuid)
+    return None, Subject(uuid, name, unit_name(name), scope.flag, file)
 
 
 def _subject(scope: Scope, cell: Cell) -> Subject:
@@ -259,7 +263,8 @@ def subject_row(manager: Manager, scope: Scope, subject: Subject) -> DataflowRow
         return read_whole_rows(manager, scope, [cell])[0]
     known = DataflowRow(subject.uuid, subject.name, subject.unit, "", subject.file)
     ended = Selector(subject.uuid).ended(scope) or known
-    return mark_bundles(scope, mark_enabled(manager, scope, [ended]))[0]
+    row = ended._replace(dataflow=subject.file)
+    return mark_bundles(scope, mark_enabled(manager, scope, [row]))[0]
 
 
 def _own_matches(scope: Scope, subject: Subject) -> list[str]:

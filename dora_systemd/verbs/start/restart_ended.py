@@ -96,6 +96,16 @@ def find_asked(scope: Scope, selector: Selector) -> Asked | None:
     return next((one for one in uuids if selector.meant([one])), None)
 
 
+def recorded_file(scope: Scope, name: str, uuid: str) -> str:
+    """Return the file of an ended dataflow by the record of its start, or "" if that is unknown."""
+    with suppress(DoraSystemdError):
+        found = find_asked(scope, Selector(name))
+        if found and found.uuid == uuid:
+            _refuse_released(scope, found)
+            return found.dataflow
+    return ""
+
+
 def find_known(
     manager: Manager, scope: Scope, texts: Sequence[str]
 ) -> tuple[list[Cell], list[Asked]]:

@@ -90,7 +90,7 @@ LATE = {
         },
         "verbs.facts.recorded": {"adapters.bus.systemd", "verbs.facts.cells"},
         "verbs.facts.selector": {"verbs.facts.ended"},
-        "verbs.list": {"verbs.facts.ended"},
+        "verbs.list": {"verbs.facts.ended", "verbs.start.restart_ended"},
         "runner.nodes.lost_entries": {"adapters.journal.reader"},
         "verbs.stop": {
             *("adapters.host.unit_files", "adapters.journal.reader", "decisions.unit.file"),
@@ -144,7 +144,9 @@ LATE = {
             *("adapters.host.addresses", "adapters.host.watch"),
             "decisions.machines.spread",
         },
-        "verbs.why": {"verbs.facts.machines", "verbs.releases.listing"},
+        "verbs.why": {
+            *("verbs.facts.machines", "verbs.releases.listing", "verbs.start.restart_ended"),
+        },
         "verbs.start.unit": {"adapters.host.watch", "decisions.machines.link_unit"},
         "verbs.start.start": {"decisions.machines.link_unit"},
         "verbs.start.enable": {"decisions.machines.link_unit"},

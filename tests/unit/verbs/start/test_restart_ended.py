@@ -20,6 +20,7 @@ from dora_systemd.verbs.start.restart_ended import (
     find_start,
     means_name,
     note_start,
+    recorded_file,
 )
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import UUID, FakeManager, options
@@ -120,6 +121,23 @@ def test_a_journal_that_cannot_be_read(journal: FakeJournal) -> None:
     journal.complain("No journal files were opened due to insufficient permissions.")
     with pytest.raises(DoraSystemdError, match="no dataflow named 'robot'"):
         find_start(FakeManager(), SCOPE, Selector("robot"))
+
+
+@pytest.mark.parametrize(
+    ("records", "file"),
+    [
+        ([record()], "/srv/robot.yml"),
+        ([record(uuid=UUID.replace("5", "6"))], ""),
+        ([record(DORA_EVENT="release-committed", DORA_RELEASE="a1"), record()], ""),
+        ([], ""),
+    ],
+)
+def test_the_file_of_what_has_ended(
+    records: list[dict[str, Any]], file: str, journal: FakeJournal
+) -> None:
+    """It is unknown of a release, and if another dataflow has got the name since."""
+    journal.write(*records)
+    assert recorded_file(SCOPE, "robot", UUID) == file
 
 
 def test_names_and_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
