@@ -10,7 +10,7 @@ from contextlib import suppress
 from itertools import takewhile
 from typing import Any
 
-from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager, queued_job
+from dora_systemd.adapters.bus.manager import DOWN, ON_THE_WAY, SETTLED, Manager, queued_job
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import Owed, owes_of
@@ -162,9 +162,9 @@ class Gate:
             if fault := self._fault():
                 return fault
             if state not in SETTLED:
-                return self._end(state)
+                return self._stopped(invocation)
             if self._invocation() != invocation:
-                return Fault("systemd has restarted it")
+                return self._restarted()
             late = self._unheard() if is_over else None
             self._tell(
                 soaking(
@@ -180,6 +180,22 @@ class Gate:
                 how = f"no {late.output} within {format_duration(late.first)} of its start"
                 return Fault(f"node {late.node}: silent, {how}", late.node)
             time.sleep(min(_LOOK_SECONDS, max(soak / SECOND - passed, _STEP_SECONDS)))
+
+    def _stopped(self, invocation: str) -> Fault | None:
+        """Wait until a stop is over, and judge it; before that nobody knows who stopped it."""
+
+        def is_new() -> bool:
+            return self._invocation() != invocation
+
+        state = settle(self._manager, self._unit, START_LIMIT, self._tell_start, is_new)
+        return self._end(state) if state in DOWN else self._restarted()
+
+    def _restarted(self) -> Fault:
+        if fault := self._fault():
+            return fault
+        if self._manager.read(self._unit, ["NRestarts"])["NRestarts"]:
+            return Fault("systemd has restarted it")
+        return Fault("it was restarted", is_outside=True)
 
     def _unheard(self) -> Owed | None:
         """The owed output that the trial has to wait for the longest, if any has not come yet."""

@@ -20,6 +20,8 @@ from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, options, with_owes
 
 HUNG = "the supervisor process hung and was killed by the watchdog"
+STOPPED = Fault("it was stopped", is_stop=True)
+RESTARTED = Fault("it was restarted", is_outside=True)
 IMAGE, DEPTH = Owed("camera", "image", SECOND, 3 * SECOND), Owed("camera", "depth", SECOND, SECOND)
 
 
@@ -83,9 +85,10 @@ def test_what_never_comes_fails_it(manager: FakeManager, scope: Scope, clock: li
     ("after", "facts", "fault"),
     [
         (0.5, {}, None),
-        (0.5, {"InvocationID": b"\2"}, Fault("systemd has restarted it")),
+        (0.5, {"InvocationID": b"\2", "NRestarts": 1}, Fault("systemd has restarted it")),
+        (0.5, {"InvocationID": b"\2"}, RESTARTED),
         (5.0, {"InvocationID": b"\2"}, None),
-        (0.5, {"ActiveState": "inactive"}, Fault("it was stopped", is_stop=True)),
+        (0.5, {"ActiveState": "inactive"}, STOPPED),
         (0.5, {"ActiveState": "failed", "Result": "watchdog"}, Fault(HUNG)),
     ],
 )
@@ -104,6 +107,31 @@ def test_what_becomes_of_the_unit_while_it_is_watched(
             return super().read(unit, names)
 
     manager = Changing()
+    manager.add(options(), InvocationID=b"\1")
+    assert Gate(manager, scope, options(), lambda _: None)._soak(2 * SECOND) == fault
+
+
+@pytest.mark.usefixtures("journal")
+@pytest.mark.parametrize(
+    ("then", "fault"),
+    [
+        ({"ActiveState": "inactive", "Job": (0, "/")}, STOPPED),
+        ({"ActiveState": "activating", "InvocationID": b"\2"}, RESTARTED),
+    ],
+)
+def test_a_stop_is_judged_when_it_is_over(
+    scope: Scope, clock: list[float], then: dict[str, object], fault: Fault
+) -> None:
+    """Nodes may take their time: neither failed the release, and a stop stays one."""
+
+    class Stopping(FakeManager):
+        def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+            if clock[0] > 1000.5:
+                self.units[unit] |= {"ActiveState": "deactivating", "Job": (1, "/")}
+            self.units[unit] |= then if clock[0] > 1004 else {}
+            return super().read(unit, names)
+
+    manager = Stopping()
     manager.add(options(), InvocationID=b"\1")
     assert Gate(manager, scope, options(), lambda _: None)._soak(2 * SECOND) == fault
 
@@ -186,7 +214,6 @@ def test_a_node_may_wait_for_what_it_needs(
 
 WORDS = f"{FAILED_BECAUSE}node camera: exit code 1 after 2 restarts"
 CRASHED = Fault("node camera: exit code 1", "camera")
-STOPPED = Fault("it was stopped", is_stop=True)
 REFUSED = {"StatusText": "failed: cannot use x: y; hint: z", "ExecMainStatus": 72}
 
 
