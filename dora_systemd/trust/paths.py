@@ -138,6 +138,15 @@ def exists(path: str | Path) -> bool:
         return False
 
 
+def is_link(path: Path) -> bool:
+    """Whether the last component of `path` is a symbolic link, wherever that leads."""
+    try:
+        with reached(path.parent) as (parent, _):
+            return stat.S_ISLNK(os.lstat(path.name, dir_fd=parent).st_mode)
+    except (DoraSystemdError, OSError, ValueError):
+        return False
+
+
 def is_directory(path: str | Path) -> bool:
     """Whether a directory exists at `path`; not for a link that must not be followed."""
     try:

@@ -132,7 +132,7 @@ def find_project(scope: Scope, request: StartRequest) -> Project:
     scope, files = scope_of(is_user=not is_root), read_files(request)
     settings = settings_of(scope, files, request)
     directory = working_directory(files, settings)
-    user = choose_user(scope, settings[USER], files.place, directory)
+    user = choose_user(scope, settings[USER], files.place, directory, settings.source(USER))
     with sight_of(account_of(user)) as sight:
         read = Read(scope, request, files, files.dataflow(), Look(sight, settings, user, directory))
         _check_user(read)

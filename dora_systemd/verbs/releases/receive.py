@@ -196,8 +196,8 @@ def _source(
         flags[WORKING_DIRECTORY.name] = str(directory)
     start = request.start._replace(dataflow=str(path), name=parcel.name, flags=flags)
     files = read_files(start)
-    wanted = settings_of(scope, files, start)[USER]
-    user = choose_user(scope, wanted, files.place, str(directory))
+    settings = settings_of(scope, files, start)
+    user = choose_user(scope, settings[USER], files.place, str(directory), settings.source(USER))
     draft.lend(None if user is None else user.pw_gid)
     source = find_source(scope, start, bool(request.build_timeout))
     # All files that were sent, whatever the rules about files on this host are.

@@ -66,7 +66,7 @@ def make_plan(scope: Scope, request: StartRequest, read: Files | None = None) ->
     settings = settings_of(scope, files, request)
     require_effect(settings, request.changed if request.uuid else request.flags)
     directory = working_directory(files, settings)
-    user = choose_user(scope, settings[USER], files.place, directory)
+    user = choose_user(scope, settings[USER], files.place, directory, settings.source(USER))
     with sight_of(account_of(user)) as sight:
         dataflow = files.dataflow()  # the child that checks paths as another user boots meanwhile
         look = Look(sight, settings, user, directory)

@@ -17,7 +17,7 @@ from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import release_of, settings_path
 from dora_systemd.scope import Scope, config_home
 from dora_systemd.trust.files import Text, read_file, unreadable
-from dora_systemd.trust.paths import Place, exists
+from dora_systemd.trust.paths import Place, exists, is_link, refusal
 from dora_systemd.trust.sight import Sight
 from dora_systemd.values import as_mapping
 from dora_systemd.verbs.start.request import DEFAULT_FILE, StartRequest, path_of, request_name
@@ -97,12 +97,26 @@ def read_beside(dataflow: Path, origin: Place | None = None) -> SettingsFile | N
     file that was copied with it.
     """
     path = Path(settings_path(str(dataflow)))
-    return read_settings_file(path, origin) if exists(path) else None
+    return read_settings_file(path, origin) if _is_there(path) else None
 
 
 def read_general(environment: Mapping[str, str]) -> tuple[SettingsFile, ...]:
     """The settings files for all dataflows, highest precedence first. Raises DoraSystemdError."""
-    return tuple(read_settings_file(one) for one in config_files(environment) if exists(one))
+    return tuple(read_settings_file(one) for one in config_files(environment) if _is_there(one))
+
+
+def _is_there(path: Path) -> bool:
+    """Whether a settings file is at `path`.
+
+    Raises DoraSystemdError (BAD_INPUT) for a link that leads nowhere: without the file the limits
+    in it would be lost, and nobody would notice.
+    """
+    if exists(path):
+        return True
+    if is_link(path):
+        reason = "it is a link that leads to no readable file"
+        raise refusal(path, reason, "correct the link, or remove it")
+    return False
 
 
 def config_files(environment: Mapping[str, str]) -> list[Path]:

@@ -8,7 +8,13 @@ from dora_systemd.adapters.host.files import decoded, find_line
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.stops import STOP_LIMIT
-from dora_systemd.decisions.settings.table import ENV_FILE, GRACE_DURATION, NODES, SETTINGS
+from dora_systemd.decisions.settings.table import (
+    ENV_FILE,
+    GRACE_DURATION,
+    NODES,
+    SETTINGS,
+    USER,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode, WrongKey, bad_input
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import hint_of_changeable
@@ -31,6 +37,8 @@ def settings_of(scope: Scope, files: Files, request: StartRequest) -> Settings:
     """
     flags, environment = request.flags, request.environment
     found = [*([files.beside] if files.beside else []), *files.general]
+    if scope.is_user:
+        found = [_without_user(one) if one.path == SYSTEM_FILE else one for one in found]
     others = [] if scope.is_user else [one for one in found if not one.is_roots]
     for one in others:
         require_modest(one)
@@ -42,6 +50,14 @@ def settings_of(scope: Scope, files: Files, request: StartRequest) -> Settings:
     roots = _resolved([one for one in found if one not in others], flags, environment)
     named, by_root = settings[ENV_FILE], roots[ENV_FILE]
     return replace(settings, lent=frozenset(one for one in named if one not in by_root))
+
+
+def _without_user(read: SettingsFile) -> SettingsFile:
+    """The system's settings file for user scope: its `user` is for dataflows of the system."""
+    document = as_mapping(read.document)
+    if USER.name not in document:
+        return read
+    return read._replace(document={key: one for key, one in document.items() if key != USER.name})
 
 
 def _resolved(

@@ -22,7 +22,14 @@ from dora_systemd.decisions.notice.command import words_of
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.decisions.settings.resolve import Settings, with_settings
-from dora_systemd.decisions.settings.table import DORA, ENV, ENV_FILE, VENV, WORKING_DIRECTORY
+from dora_systemd.decisions.settings.table import (
+    DORA,
+    ENV,
+    ENV_FILE,
+    USER,
+    VENV,
+    WORKING_DIRECTORY,
+)
 from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import unreadable
@@ -249,22 +256,23 @@ def working_directory(files: Files, settings: Settings) -> str:
 
 
 def choose_user(
-    scope: Scope, wanted: str | None, dataflow: Place, directory: str
+    scope: Scope, wanted: str | None, dataflow: Place, directory: str, source: str = "--uid"
 ) -> pwd.struct_passwd | None:
     """The user for User=, or None if everything runs as the manager's own user.
 
     Default: the owner of the dataflow file that was read, or DEFAULT_USER if that is root.
-    directory: that of the programs. Raises DoraSystemdError.
+    directory: that of the programs. source: of `wanted`, as of Settings. Raises DoraSystemdError.
     """
     if scope.is_user:
         if wanted is not None:
-            raise usage_error(
+            raise _not_usable(
                 "cannot choose the user of a dataflow with --user",
-                "leave --uid out, or use --system as root",
+                f"leave {_key(source)} out, or use --system as root",
+                source,
             )
         return None
     if wanted is not None:
-        return _entry(wanted)
+        return _entry(wanted, source)
     try:
         with reached(directory) as (_, place):
             check_identity(dataflow, place)
@@ -306,8 +314,19 @@ def check_identity(dataflow: Place, directory: Place) -> None:
         )
 
 
-def _entry(wanted: str) -> pwd.struct_passwd:
-    refusal = usage_error(f"cannot find a user {quoted(wanted)}", "see getent passwd")
+def _key(source: str) -> str:
+    return USER.name if source.startswith("/") else source
+
+
+def _not_usable(message: str, hint: str, source: str) -> DoraSystemdError:
+    """The error for a user that a settings file, a variable or a flag names."""
+    if source.startswith("/"):
+        return bad_input(f"{message} ({USER.name} in {shown(source)})", hint)
+    return usage_error(f"{message} ({source})", hint)
+
+
+def _entry(wanted: str, source: str) -> pwd.struct_passwd:
+    refusal = _not_usable(f"cannot find a user {quoted(wanted)}", "see getent passwd", source)
     is_number = wanted.isascii() and wanted.isdigit() and len(wanted) <= _MOST_DIGITS
     return _known(int(wanted) if is_number else wanted, refusal)
 

@@ -15,6 +15,7 @@ from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS, UV
+from dora_systemd.decisions.settings.table import USER as USER_SETTING
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import Place, reached
@@ -24,6 +25,7 @@ from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.plan import Plan, make_plan
 from dora_systemd.verbs.start.read import (
     SYSTEM_FILE,
+    SettingsFile,
     config_files,
     named_places,
     read_files,
@@ -243,6 +245,25 @@ def test_a_wrong_key_is_named_with_its_line(project: Path, text: str, words: str
         check_config(USER, path)
 
 
+@pytest.mark.parametrize("target", ["nothing", "robot.systemd.yml"])
+def test_a_link_that_leads_nowhere_is_no_missing_file(project: Path, target: str) -> None:
+    """The limits in the file would be lost; without any file there are none."""
+    (project / "robot.systemd.yml").symlink_to(target)
+    with pytest.raises(DoraSystemdError, match="leads to no readable file") as caught:
+        settings(USER, project / "robot.yml")
+    assert caught.value.code is ExitCode.BAD_INPUT
+    assert "robot.systemd.yml" in caught.value.message
+
+
+def test_the_user_of_the_system_is_none_of_user_scope(project: Path) -> None:
+    request = StartRequest(str(project / "robot.yml"), None, {})
+    read = SettingsFile(SYSTEM_FILE, place_of(Path("/etc")), b"", {"user": "root", "uv": True})
+    files = read_files(request)._replace(general=(read,))
+    found = settings_of(USER, files, request)
+    assert (found[USER_SETTING], found[UV]) == (None, True)
+    assert settings_of(SYSTEM, files, request)[USER_SETTING] == "root"
+
+
 def test_settings_beside_the_dataflow(project: Path) -> None:
     (project / "robot.systemd.yml").write_text("uv: yes\n")
     assert settings(USER, project / "robot.yml")[UV] is True
@@ -444,6 +465,10 @@ def test_a_user_that_is_asked_for(project: Path) -> None:
     for wanted in ("nobody-of-that-name", "9" * 30, "-1"):
         with pytest.raises(DoraSystemdError, match="cannot find a user"):
             choose_user(SYSTEM, wanted, place, str(project))
+    for scope, hint in ((SYSTEM, "see getent passwd"), (USER, "leave user out")):
+        with pytest.raises(DoraSystemdError, match=r"\(user in /a\.yml\)") as caught:
+            choose_user(scope, "nobody-of-that-name", place, str(project), "/a.yml")
+        assert (caught.value.code, hint in caught.value.hint) == (ExitCode.BAD_INPUT, True)
 
 
 def test_what_the_cell_can_reach(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
