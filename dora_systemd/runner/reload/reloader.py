@@ -21,7 +21,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions, SettingText, chan
 from dora_systemd.decisions.cell.rights import essential_nodes
 from dora_systemd.decisions.descriptor.dataflow import downstream_of
 from dora_systemd.decisions.life import events as life
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.names import settings_path
 from dora_systemd.runner.cell.failure import words
 from dora_systemd.runner.cell.pump import now_us
@@ -337,7 +337,7 @@ class Reloader:
             return []
         if identity(dataflow) is None:
             message = f"cannot read {dataflow}: there is no such file"
-            raise DoraSystemdError(message, "put it back, or stop the dataflow", ExitCode.NOT_FOUND)
+            raise bad_input(message, "put it back, or stop the dataflow")
         self._note_imports()
         versions = self._versions
         stale = {path for path in (dataflow, self._settings.path) if versions.differ(path)}

@@ -236,7 +236,7 @@ def test_a_file_that_is_away_and_comes_back_as_it_was(tmp_path: Path) -> None:
         root.rename(tmp_path / "away")
         with pytest.raises(DoraSystemdError, match="there is no such file") as caught:
             await bench.by_hand()
-        assert caught.value.code is ExitCode.NOT_FOUND
+        assert caught.value.code is ExitCode.BAD_INPUT
         (tmp_path / "away").rename(root)
         await bench.reloader._reload([str(root / "a.py")])
         assert await bench.by_hand() == []
