@@ -71,7 +71,7 @@ def roll_back(
         if options is None or options.name != store.name:
             message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"
             raise bad_input(message, f"doractl releases {store.name} lists the others")
-        if chosen != standing.current:  # what every start runs anyway
+        if chosen != standing.current or not standing.trial:  # a trial has to end in any case
             tell(checking())
             _require_intact(store, manifest)
         # One that was disabled stays so.
@@ -118,10 +118,13 @@ def _choose(store: Store, standing: Standing, release: str | None) -> str:
         # A trial whose doractl was killed: what is on the disk has proved itself.
         return standing.current if standing.trial else _before(store, standing)
     ids = [one.id for one in store.known()]
-    if release not in ids or not is_directory(store.tree(release)):
+    if release not in ids:
         hint = did_you_mean(release, ids) or f"doractl releases {store.name} lists all"
         message = f"{store.name} has no release {quoted(release)}"
         raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+    if not is_directory(store.tree(release)):
+        message = f"cannot run release {release} of {store.name}: its files are gone"
+        raise bad_input(message, f"doractl releases {store.name} lists the others")
     return release
 
 

@@ -51,11 +51,15 @@ def test_what_is_disabled_stays_so(manager: FakeManager, scope: Scope) -> None:
     assert (standing.current, standing.boot.is_enabled) == (OLD, False)
 
 
+@pytest.mark.parametrize("current", [OLD, NEW])
 @pytest.mark.parametrize("damage", ["other", "", None])
 def test_a_damaged_release_is_refused(
-    manager: FakeManager, scope: Scope, store: Store, damage: str | None
+    manager: FakeManager, scope: Scope, store: Store, damage: str | None, current: str
 ) -> None:
-    """Its trial need not notice that a model has lost its weights."""
+    """Its trial need not notice that a model has lost its weights.
+
+    If it is the present one, the dataflow must keep running: nothing else could take its place.
+    """
     manager.add(release_options(NEW), "active", Transient=False)
     files = {name: Draft(store).write(name, [b"model"], False) for name in ("a.onnx", "b.onnx")}
     tree = store.tree(OLD)
@@ -63,12 +67,24 @@ def test_a_damaged_release_is_refused(
     for name in files:
         (tree / name).write_bytes(b"model")
     store.write_manifest(replace(store.manifest(OLD), files=files))
-    for release in (OLD, NEW):
+    for release in (OLD, NEW, current):
         roll_back(manager, scope, "robot", release, 0, print)
     if damage is None:
         (tree / "b.onnx").unlink()
     else:
         (tree / "b.onnx").write_text(damage)
+    before = len(manager.calls)
     with pytest.raises(DoraSystemdError, match=r"it is damaged: b\.onnx changed") as caught:
         roll_back(manager, scope, "robot", OLD, 0, print)
     assert caught.value.code == ExitCode.BAD_INPUT
+    assert manager.calls[before:] == []
+
+
+def test_a_release_without_its_files_is_named(
+    manager: FakeManager, scope: Scope, store: Store
+) -> None:
+    manager.add(release_options(NEW), "active", Transient=False)
+    store.release(OLD).chmod(0o700)
+    store.tree(OLD).rename(store.release(OLD) / "elsewhere")
+    with pytest.raises(DoraSystemdError, match=f"release {OLD} of robot: its files are gone"):
+        roll_back(manager, scope, "robot", OLD, 0, print)
