@@ -9,6 +9,7 @@ from dora_systemd.decisions.cell.exits import EARLY, ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import FROZEN, WAITING
 from dora_systemd.decisions.why.verdict import Verdict
+from dora_systemd.names import release_of
 
 _BY_HAND = "run: doractl restart {name}"
 AND_RESTART = f", then {_BY_HAND}"
@@ -174,3 +175,17 @@ def _space(path: str | None, node: str) -> str:
     if path is None:
         return f"a file system that {node} writes to is full: df shows which one"
     return f"the file system of this file is full: df {shlex.quote(path)}"
+
+
+def of_release(text: str, name: str, file: str) -> str:
+    """Turn a remedy into that of a dataflow with releases, whose files nobody must change.
+
+    file: the dataflow file, which need not belong to a release.
+    """
+    fixed = f", then run: doractl deploy --name {name}"
+    text = text.replace(f", then run: doractl restart {name}", fixed)
+    if release := release_of(file):
+        inside = file.partition(f"/{release}/tree/")[2]
+        text = text.replace(f"fix {file}", f"fix {inside} in its project")
+        text = text.replace(f"doractl start {file}", f"doractl start {name}")
+    return text

@@ -21,6 +21,7 @@ from dora_systemd.decisions.why.remedies import (
     AND_RESTART,
     about_core_dump,
     known_remedy,
+    of_release,
     remedy_of,
 )
 from dora_systemd.decisions.why.stack import Frame
@@ -133,11 +134,7 @@ def remedies(report: Report) -> list[str]:
         again = f", then run: doractl restart {subject.name}"
         return [text.replace(again, ", and save it") for text in filled]
     if release_of(subject.file) or any(one.name == ROLLED_BACK for one in verdict.timeline):
-        fixed = f"doractl deploy --name {subject.name}"
-        return [
-            text.replace(f", then run: doractl restart {subject.name}", f", then run: {fixed}")
-            for text in filled
-        ]
+        return [of_release(text, subject.name, subject.file) for text in filled]
     if subject.is_loaded:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"

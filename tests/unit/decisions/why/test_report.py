@@ -438,6 +438,11 @@ def test_what_to_do_about_a_release() -> None:
     released = replace(FULL, subject=replace(SUBJECT, file=file), verdict=failed)
     assert f"\n  Release:  {OLD}\n" in format_report(released)
     assert remedies(released) == again
+    bad = replace(VERDICT, cause=Cause.BAD_DATAFLOW, details={})
+    fix = "fix robot.yml in its project, then run: doractl deploy --name robot"
+    assert remedies(replace(released, verdict=bad)) == [fix]
+    (unknown,) = remedies(replace(released, verdict=replace(bad, cause=Cause.NO_END)))
+    assert unknown.startswith("run: doractl start robot; ")
 
 
 def test_what_to_do_about_a_trial() -> None:
