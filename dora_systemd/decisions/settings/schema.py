@@ -2,6 +2,7 @@
 
 from collections.abc import Container, Mapping, Sequence
 from functools import reduce
+from itertools import dropwhile, islice
 from operator import or_
 from types import UnionType
 from typing import Any, get_args, get_origin
@@ -64,6 +65,10 @@ def settings_model(table: Sequence[Setting[Any]], keys: Container[object]) -> ty
     return model
 
 
+_OF_TEXTS = ("env", "property", "credentials")
+"""Settings that are mappings with any keys."""
+
+
 def validation_error(
     source: str, error: ValueError, table: Sequence[Setting[Any]]
 ) -> DoraSystemdError:
@@ -81,9 +86,18 @@ def validation_error(
     else:
         key = next((part for part in reversed(place) if part in settings), place[0])
         expected = settings[key].kind.expected if key in settings else "a mapping"
-        reason, hint = f"the value of {key} is of another type", f"write {expected}"
+        hint = f"write {expected}"
+        if key in _OF_TEXTS and (entry := _entry(place)):
+            place, key, hint = [key, entry], f"{key}.{entry}", "write it as text, in quotes"
+        reason = f"the value of {key} is of another type"
     refused = refusal(source, reason, hint)
     return WrongKey(refused.message, refused.hint, source, place)
+
+
+def _entry(place: Sequence[str]) -> str:
+    """The key of a wrong value inside a mapping such as env; "" if the mapping itself is none."""
+    inside = dropwhile(lambda part: not part.startswith("dict["), place)
+    return next(islice(inside, 1, None), "")
 
 
 def _fields(table: Sequence[Setting[Any]]) -> dict[str, Any]:

@@ -231,6 +231,7 @@ def test_settings_files() -> None:
         ("nodes:\n  plot: {}\n  camera:\n    cpuu: 1\n", "of node 'camera' at line 4"),
         ("\nnodes: {camera: {cpuu: 1}}\n", "unknown key 'cpuu' of node 'camera' at line 2"),
         ("uv: [1]\n", "the value of uv is of another type at line 1"),
+        ("env:\n  A: 1\n  B:\n", "the value of env.B is of another type at line 3"),
         ("uv: no\nmemory_limit: lots\n", "robot.systemd.yml at line 2)"),
         ("nodes:\n  cam:\n    watchdog: 5x\n", "robot.systemd.yml at line 3)"),
     ],
