@@ -30,6 +30,7 @@ _CLOSE_SECONDS = 10.0
 """Timeout for the other end to close, too."""
 _PART_SECONDS = 60.0
 """Timeout for a part of a file to be taken."""
+_NO_REQUEST = "no valid request: the gateway takes GET by HTTP/1.1 only"
 _NAME = {"Server": "dora-systemd"}
 
 
@@ -61,11 +62,13 @@ class ServerSocket(Stream):
         """The request; None, and a refusal sent, if it is not valid HTTP. Raises OSError."""
         try:
             while self._opening is None:
-                if self._protocol.handshake_exc is not None:
-                    return None  # later versions of websockets have answered it themselves
+                if (error := self._protocol.handshake_exc) is not None:
+                    raise ConnectionError from error
                 await self._receive()
         except ConnectionError:
-            await self.answer(text_answer(HTTPStatus.BAD_REQUEST, "no valid HTTP"))
+            # Later versions of websockets answer some of them, such as one that is too long.
+            if not self._has_written:
+                await self.answer(text_answer(HTTPStatus.BAD_REQUEST, _NO_REQUEST))
             return None
         assert isinstance(self._opening, Request)
         return self._opening

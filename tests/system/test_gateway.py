@@ -92,8 +92,11 @@ def test_other_sites_are_kept_out(front: Front) -> None:
 
 def test_other_methods(front: Front) -> None:
     front.up()
-    assert front.get("/health", "-X", "DELETE").status in (0, 405)
-    assert front.get("/health", "-d", "x").status in (0, 405)
+    # Not all versions of websockets read the method.
+    assert front.get("/health", "-X", "DELETE").status in (400, 405)
+    assert front.get("/health", "-d", "x").status in (400, 405)
+    assert front.get("/health", "--head").status in (400, 405)
+    assert front.get("/health", "--http1.0").status == 400
     twice = ("-H", "Upgrade: x", "-H", "Upgrade: y")
     assert front.get("/health", *twice).status == 200
     assert front.get("/health").status == 200

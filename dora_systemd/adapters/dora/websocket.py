@@ -53,6 +53,7 @@ class Stream:
         self._opening: object = None
         """The first thing that was received: a response, or a request."""
         self._is_over = False
+        self._has_written = False
 
     async def recv(self) -> str | bytes:
         """The next message. Raises OSError; ConnectionError if either side has closed."""
@@ -101,6 +102,7 @@ class Stream:
         for data in self._protocol.data_to_send():
             if data:
                 self._writer.write(data)
+                self._has_written = True
             self._is_over |= not data  # the protocol layer sends nothing more
 
     async def _push(self) -> None:
