@@ -86,6 +86,8 @@ def _complaint_error(complaint: str) -> DoraSystemdError:
         return usage_error(f"cannot read the time{complaint[25:]}", hint)
     if complaint.startswith("Bad pattern"):
         return usage_error(f"cannot use the {complaint[4:]}", "see pcre2pattern(3)")
+    if complaint.startswith(("Please specify", "--since=", "Failed to parse --lines=")):
+        return usage_error(f"cannot read the journal so: {complaint}", "see journalctl(1)")
     if " boot " in complaint:
         hint = "journalctl --list-boots shows them"
         return DoraSystemdError(f"cannot find the boot: {complaint}", hint, ExitCode.NOT_FOUND)

@@ -54,6 +54,16 @@ def journalctl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "No such boot ID in journal",
             ExitCode.NOT_FOUND,
         ),
+        (
+            "Please specify either --reverse or --follow, not both.",
+            "cannot read the journal so: Please specify either --reverse or --follow, not both.",
+            ExitCode.USAGE,
+        ),
+        (
+            "--since= must be before --until=.",
+            "cannot read the journal so: --since= must be before --until=.",
+            ExitCode.USAGE,
+        ),
         ("Something else", "cannot read the journal: Something else", ExitCode.FAILURE),
     ],
 )
