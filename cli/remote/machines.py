@@ -59,7 +59,7 @@ def find_machines(scope: Scope, context: click.Context) -> tuple[list[Host], Pla
     if cell is None or not known:
         if wanted:
             message = f"cannot find machine {quoted(wanted)}: {selectors[0]} runs on this one only"
-            raise usage_error(message, "doractl list NAME shows machines")
+            raise usage_error(message, "leave out --machine")
         return None
     if scope != scope_of(None):
         # Only the user of that scope has its keys for ssh.

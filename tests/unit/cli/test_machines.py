@@ -97,6 +97,13 @@ def test_wrong_machines(words: tuple[str, ...], code: ExitCode) -> None:
     assert caught.value.code is code
 
 
+def test_hint_for_one_machine() -> None:
+    """No verb shows machines of a dataflow that has only this one."""
+    with pytest.raises(DoraSystemdError) as caught:
+        found("alone", "--machine", "gpu")
+    assert caught.value.hint == "leave out --machine"
+
+
 HERE = """printf '__REALTIME_TIMESTAMP=1\\nSYSLOG_IDENTIFIER=robot/cam\\nMESSAGE=here\\n\\n'"""
 LOGIN = 'for command; do :; done\nHOST=gpu; export HOST; exec sh -c "$command"'
 
