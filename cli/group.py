@@ -193,7 +193,9 @@ def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
         result = group.main(arguments, prog_name="doractl", standalone_mode=False)
     except click.ClickException as error:
         raise _usage_error(error, arguments) from error
-    except click.Abort:
+    except click.Abort as abort:
+        if abort.__cause__ is None:  # of a question: click does not end its line
+            click.echo(err=True)
         return ExitCode.INTERRUPTED
     except SystemExit as error:
         # Here click exits by itself only if the reader of the output is gone.

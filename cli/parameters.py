@@ -1,5 +1,6 @@
 """Options and arguments that several verbs share."""
 
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -178,6 +179,11 @@ def tell(text: str, err: bool = False) -> None:
     """Print a line, unless the output is JSON."""
     if not wants_json():
         click.echo(text, err=err)
+
+
+def can_ask() -> bool:
+    """Whether a person sees a question, which is written to standard error, and can answer it."""
+    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) -> None:

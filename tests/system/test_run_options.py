@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.terminal import Screen
@@ -139,11 +140,17 @@ def test_stop_asks_on_a_terminal(cell: Cell, project: Project) -> None:
         one.start(project.three_nodes())
     refused = run("doractl", "--system", "stop", check=False, stdin=subprocess.DEVNULL)
     assert refused.stderr.startswith("doractl: cannot stop: give names or --all\nhint: ")
+    unseen = Screen(["sh", "-c", "doractl --system stop 2>/dev/null"])
+    assert unseen.end() == ExitCode.USAGE, "nobody would see the question"
     screen = Screen(["doractl", "--system", "stop"])
     wait_for("it asks", lambda: "Number or name" in "".join(screen.lines()))
     screen.press(f"{other.name}\n".encode())
     assert screen.end() == 0
     assert other.is_gone
+    screen = Screen(["doractl", "--system", "forget", other.name])
+    screen.press(b"n\n")
+    assert screen.end() == ExitCode.FAILURE
+    assert "doractl: nothing was removed" in "".join(screen.lines())
     assert not cell.is_gone
     screen = Screen(["doractl", "--system", "stop"])
     assert screen.end() == 0

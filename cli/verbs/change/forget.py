@@ -1,13 +1,11 @@
 """Remove releases, or all that is kept of a dataflow."""
 
-import sys
-
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
+from dora_systemd.cli.parameters import acting_options, can_ask, current_scope, print_outcomes
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import ExitCode, usage_error
+from dora_systemd.errors import DoraSystemdError, usage_error
 from dora_systemd.verbs.releases.forget import Kept, find_kept, forget, remove_releases
 
 
@@ -33,7 +31,7 @@ def command(selector: str, releases: tuple[str, ...], force: bool) -> int:
         return print_outcomes(_removed(kept, one) for kept, one in done)
     kept = find_kept(bus, scope, selector)
     if not (force or _agrees(kept)):
-        return ExitCode.INTERRUPTED
+        raise DoraSystemdError("nothing was removed", "--force removes it without a question")
     forget(bus, scope, kept)
     details = {"releases": list(kept.releases)}
     text = f"Dataflow forgotten: {kept.uuid or '-'} ({kept.name}), {_count(kept)}"
@@ -46,7 +44,7 @@ def _removed(kept: Kept, release: str) -> Outcome:
 
 def _agrees(kept: Kept) -> bool:
     """Ask at the terminal for a confirmation. Raises DoraSystemdError (USAGE) without terminal."""
-    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+    if not can_ask():
         raise usage_error(f"cannot forget {kept.name}: nobody can be asked", "use --force")
     return click.confirm(f"Remove {_count(kept)} of {kept.name} for good?", err=True)
 

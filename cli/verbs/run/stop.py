@@ -10,6 +10,7 @@ from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import (
     acting_options,
+    can_ask,
     current_scope,
     duration_option,
     print_outcomes,
@@ -71,7 +72,7 @@ def command(
         raise usage_error("cannot use --force with --grace-duration", "give one of them")
     most = 0 if force else min(kill_delay(grace_duration), INFINITY)
     texts = (*selectors, *([name] if name else []))
-    if texts or want_all or not sys.stdin.isatty():
+    if texts or want_all or not can_ask():
         require_names_or_all("stop", texts, want_all)
     scope = current_scope()
     bus = Bus(scope)
@@ -132,7 +133,7 @@ def _ask_inhibited(scope: Scope, cells: Sequence[Cell]) -> None:
 def _stop(bus: Bus, scope: Scope, cells: list[Cell], most: int) -> int:
     refuse_parts(cells, "stop")
     dependents = find_dependents(bus, cells)
-    if most > 0 and sys.stdin.isatty():
+    if most > 0 and can_ask():
         _ask_dependents(cells, dependents)
         _ask_inhibited(scope, [*cells, *dependents])
     elif dependents:
