@@ -1,26 +1,38 @@
 """Show live resource usage of dataflows and nodes."""
 
+import re
 import sys
 import time
 
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, output_option, scope_options
+from dora_systemd.cli.parameters import current_scope, output_option, parsed_by, scope_options
 from dora_systemd.cli.screen import FIRST_SECONDS, show_live
 from dora_systemd.cli.terminal import is_dumb
 from dora_systemd.decisions.views.objects import format_json
 from dora_systemd.decisions.views.top import SORTS, format_top, look_values
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import ExitCode, usage_error
+from dora_systemd.values import quoted
 from dora_systemd.verbs.top import Top
+
+_SECONDS = r"[0-9]{1,5}(\.[0-9]*)?|\.[0-9]+"
+
+
+def parse_interval(text: str) -> float:
+    """Seconds between two readings. Raises DoraSystemdError (USAGE), also for "nan" and "inf"."""
+    seconds = float(text) if re.fullmatch(_SECONDS, text) else 0.0
+    if seconds < 0.1:
+        raise usage_error(f"cannot use {quoted(text)} as an interval", "0.1 to 99999 seconds")
+    return seconds
 
 
 @click.command("top")
 @click.argument("selectors", nargs=-1, metavar="[SELECTOR]...")
 @click.option(
     "--interval",
-    type=click.FloatRange(min=0.1),
-    default=2.0,
+    default="2",
+    callback=parsed_by(parse_interval),
     show_default=True,
     metavar="SECONDS",
     help="Time from one reading to the next.",

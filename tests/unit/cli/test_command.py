@@ -1,5 +1,6 @@
 """The command line of doractl, without a systemd behind it."""
 
+import io
 import os
 import subprocess
 import sys
@@ -16,9 +17,10 @@ from hypothesis import strategies as st
 
 from dora_systemd import __version__
 from dora_systemd.cli import listing, main
-from dora_systemd.cli.group import ALIASES, HIDDEN, VERBS, doractl
+from dora_systemd.cli.group import ALIASES, HIDDEN, VERBS, doractl, run_verb
 from dora_systemd.cli.listing import ListRequest
 from dora_systemd.cli.parameters import current_scope
+from dora_systemd.cli.verbs.look.top import parse_interval
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import scope_of
@@ -314,6 +316,28 @@ def test_exit_status_of_errors(
     assert main.run(["list"], failing(error)) == status
     expected = "doractl: cannot do it\nhint: do that\n" if status != 130 else ""
     assert capsys.readouterr().err == expected
+
+
+def test_a_question_that_is_interrupted_ends_its_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The prompt of the shell comes in the next line, after Ctrl+D, too."""
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    asking = click.Group(commands={"ask": click.Command("ask", callback=lambda: ask())})
+
+    def ask() -> None:
+        click.confirm("Stop robot?", err=True)
+
+    assert run_verb(["ask"], asking) == ExitCode.INTERRUPTED
+    assert capsys.readouterr().err == "Stop robot? [y/N]: \n"
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "1e9", "-1", "0", "0.09", "x", ""])
+def test_top_refuses_an_interval_that_it_cannot_wait(text: str) -> None:
+    with pytest.raises(DoraSystemdError, match="as an interval") as caught:
+        parse_interval(text)
+    assert caught.value.code is ExitCode.USAGE
+    assert [parse_interval(one) for one in ("2", "2.0", ".5", "99999")] == [2.0, 2.0, 0.5, 99999.0]
 
 
 @pytest.mark.parametrize(
