@@ -18,6 +18,7 @@ from dora_systemd.cli.edge import Edge, with_target, write_view
         ("doractl: no dataflow named 'x'", "doractl: no dataflow named 'x'"),
         ("doractl -H c why x", "doractl -H c why x"),
         ("stopped by root (doractl stop)", "stopped by root (doractl stop)"),
+        ("hint: on head: doractl stop robot", "hint: on head: doractl stop robot"),
         ("the gateway, see doractl env", "the gateway, see doractl env on a@b:7"),
         ("or doractl --user env for it", "or doractl --user env on a@b:7 for it"),
     ],
@@ -35,6 +36,7 @@ def test_commands_are_for_the_host_they_are_about(text: str, there: str | None) 
         ("doractl --user list", "doractl --user list"),
         ("stopped by root (doractl stop)", "stopped by root (doractl stop)"),
         ("see doractl env", "see doractl --system env"),
+        ("on head: doractl stop x", "on head: doractl --system stop x"),
     ],
 )
 def test_commands_are_in_the_scope_they_are_about(text: str, there: str) -> None:
