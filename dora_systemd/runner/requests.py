@@ -264,8 +264,8 @@ def _gone(node: str, old: NodeStatus) -> DoraSystemdError:
 
 def _require_running(cell: Cell) -> None:
     if cell.state is not State.RUNNING:
-        is_early = cell.state is State.WAITING
-        raise _not_running("not all nodes are ready yet" if is_early else "it is stopping")
+        is_late = cell.state in (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
+        raise _not_running("it is stopping" if is_late else "not all nodes are ready yet")
 
 
 def _not_running(why: str) -> DoraSystemdError:

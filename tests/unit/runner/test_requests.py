@@ -377,6 +377,8 @@ def test_a_start_can_go_on_without_a_node_that_waits(tmp_path: Path) -> None:
         ("restart", State.RUNNING, {"state": "failed", "exit": exit_of(1)}, "failed: exit code 1"),
         ("restart", State.WAITING, {}, "not all nodes are ready yet"),
         ("stop", State.WAITING, {}, "not all nodes are ready yet"),
+        ("restart", State.STARTING, {}, "not all nodes are ready yet"),
+        ("restart", State.GATHERING, {}, "not all nodes are ready yet"),
         ("stop", State.STOPPING, {}, "it is stopping"),
         ("stop", State.RUNNING, {"kind": "dynamic", "state": "dynamic"}, "dynamic node"),
         ("kill", State.RUNNING, {}, "cannot do"),
