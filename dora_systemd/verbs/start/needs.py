@@ -66,7 +66,7 @@ def _check_unit(manager: Manager, plan: Needy, need: str, unit: str) -> None:
     if not need.startswith(DATAFLOW):
         raise _refusal(plan, need, f"unit {unit} is {state}", "see systemctl list-unit-files")
     name = need.removeprefix(DATAFLOW)
-    hint = f"start it first, or enable it: doractl enable {name}"
+    hint = "start it first; start --enable starts it at boot, too"
     raise _refusal(plan, need, f"no dataflow named '{name}'", hint)
 
 

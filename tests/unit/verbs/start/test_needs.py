@@ -4,9 +4,10 @@ import pytest
 
 from dora_systemd.decisions.needs.words import NodeNeed
 from dora_systemd.decisions.properties.sandbox import Sandbox
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import need_failure
-from dora_systemd.verbs.start.needs import needs_warnings
+from dora_systemd.verbs.start.needs import Needy, check_needs, needs_warnings
 from dora_systemd.verbs.stop import find_dependents, format_dependents
 from tests.unit.fakes.manager import FakeManager, options
 
@@ -39,6 +40,14 @@ def test_a_private_network_has_no_interfaces_of_the_machine(level: str) -> None:
     assert not [*needs_warnings((), needs, Sandbox(level), ())]
     (told,) = needs_warnings((), needs, Sandbox(level, "private"), ())
     assert told == "node arm waits for net:can0, but a private network has only net:lo"
+
+
+def test_a_dataflow_that_is_needed_has_to_be_started() -> None:
+    """Nothing can be enabled that systemd has not loaded."""
+    with pytest.raises(DoraSystemdError, match="no dataflow named 'base'") as caught:
+        check_needs(FakeManager(), Needy("arm", False, ("dataflow:base",)))
+    assert caught.value.hint.startswith("start it first")
+    assert "doractl enable" not in caught.value.hint
 
 
 def test_what_needs_a_dataflow_ends_with_it() -> None:
