@@ -104,13 +104,14 @@ def command(
       doractl -H base,arm deploy /srv/robot   one host after the other
     """
     del serial  # for -H, see cli/remote/
+    if not build_timeout:
+        hint = "write a time such as 30min, or --no-build"
+        raise usage_error("cannot use 0 as --build-timeout", hint)
     scope = current_scope()
     start = StartRequest(dataflow, name, flags, os.environ)
     bus = Bus(scope)
     if dry_run:
         return _print_changes(bus, scope, start, not no_build, from_stdin, is_quiet)
-    if not build_timeout:
-        raise usage_error("cannot build in no time", "give a --build-timeout")
     how, build_timeout = if_inhibited(force, wait), 0 if no_build else build_timeout
     request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout, allow_waiting)
     done = _deploy(bus, scope, request, from_stdin, is_quiet)

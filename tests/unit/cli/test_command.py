@@ -468,6 +468,15 @@ def test_output_that_cannot_be_written(redirection: str, status: int, said: str,
     assert (done.returncode, done.stderr, done.stdout) == (status, said, "")
 
 
+def test_a_build_needs_time(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.run(["deploy", "--build-timeout", "0"]) == ExitCode.USAGE
+    told = capsys.readouterr().err
+    assert told == (
+        "doractl: cannot use 0 as --build-timeout\n"
+        "hint: write a time such as 30min, or --no-build\n"
+    )
+
+
 CLOSED = ("", "<&-", ">&-", "2>&-", "<&- >&- 2>&-")
 WRONG = ("nosuch", "list --last 0", "top -x", "list -q -o json")
 """Each is refused by a parser of its own."""
