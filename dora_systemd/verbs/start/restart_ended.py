@@ -134,13 +134,23 @@ def find_start(
         if error.code is ExitCode.NOT_FOUND and (found := _readable(scope, selector)):
             _refuse_released(scope, found)
             return found
-        raise
+        raise _without_start(scope, selector) or error from error
     if not is_changed:
         return cell
     if found := find_asked(scope, Selector(cell.name)):
         return found
     message = f"cannot change settings of {cell.name}: the journal does not have its start"
     raise DoraSystemdError(message, f"doractl start {cell.options.dataflow} takes the file itself")
+
+
+def _without_start(scope: Scope, selector: Selector) -> DoraSystemdError | None:
+    """The error for a dataflow that has ended and has no recorded start, as after a first trial."""
+    with suppress(DoraSystemdError):
+        if row := selector.ended(scope):
+            message = f"cannot start {row.name}: the journal does not have its start"
+            hint = f"doractl start FILE --name {row.name}, or doractl deploy --name {row.name}"
+            return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+    return None
 
 
 def _readable(scope: Scope, selector: Selector) -> Asked | None:

@@ -22,7 +22,7 @@ from dora_systemd.verbs.start.restart_ended import (
     note_start,
     recorded_file,
 )
-from tests.unit.fakes.journal import FakeJournal
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
 SCOPE = Scope(is_user=False, uid=0)
@@ -115,6 +115,15 @@ def test_what_systemd_knows_comes_first(journal: FakeJournal) -> None:
     journal.write()
     with pytest.raises(DoraSystemdError, match="the journal does not have its start"):
         find_start(manager, SCOPE, Selector("robot"), is_changed=True)
+
+
+def test_an_end_without_a_start(journal: FakeJournal) -> None:
+    """After a first deploy that failed, list and why know the name; it is no unknown one."""
+    journal.write(life_record("dataflow-failed", 19, "robot", DORA_REASON="node a: exit code 1"))
+    with pytest.raises(DoraSystemdError, match="cannot start robot: the journal") as caught:
+        find_start(FakeManager(), SCOPE, Selector("robot"))
+    assert "doractl deploy --name robot" in caught.value.hint
+    assert caught.value.code is ExitCode.NOT_FOUND
 
 
 def test_a_journal_that_cannot_be_read(journal: FakeJournal) -> None:
