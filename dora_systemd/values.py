@@ -63,6 +63,11 @@ def shown(text: str) -> str:
     return text if text.isprintable() and text.strip() == text and text else quoted(text)
 
 
+def counted(count: int, what: str) -> str:
+    """Format a number of things, as in "1 node" and "2 nodes"."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 def scalar_text(value: object) -> str:
     """A YAML scalar as the author and dora see it: true, 1, 0.5, text."""
     return str(value).lower() if isinstance(value, bool) else str(value)

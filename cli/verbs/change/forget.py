@@ -6,6 +6,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import acting_options, can_ask, current_scope, print_outcomes
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, usage_error
+from dora_systemd.values import counted
 from dora_systemd.verbs.releases.forget import Kept, find_kept, forget, remove_releases
 
 
@@ -45,10 +46,11 @@ def _removed(kept: Kept, release: str) -> Outcome:
 def _agrees(kept: Kept) -> bool:
     """Ask at the terminal for a confirmation. Raises DoraSystemdError (USAGE) without terminal."""
     if not can_ask():
-        raise usage_error(f"cannot forget {kept.name}: nobody can be asked", "use --force")
+        raise usage_error(
+            f"cannot forget {kept.name}: the question needs a terminal", "use --force"
+        )
     return click.confirm(f"Remove {_count(kept)} of {kept.name} for good?", err=True)
 
 
 def _count(kept: Kept) -> str:
-    count = len(kept.releases)
-    return f"{count} release{'' if count == 1 else 's'}"
+    return counted(len(kept.releases), "release")

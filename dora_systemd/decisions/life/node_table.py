@@ -17,7 +17,7 @@ from dora_systemd.decisions.descriptor.dataflow import Downstream
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.logs.journal_events import NODE_FAILURES
-from dora_systemd.values import SECOND, format_duration
+from dora_systemd.values import SECOND, counted, format_duration
 
 NodeTable = Mapping[str, NodeStatus]
 Change = tuple[NodeTable, Record | None]
@@ -367,7 +367,7 @@ def _state_after(event: life.NodeExited, is_stopping: bool) -> str:
 def spent(nodes: NodeTable) -> dict[str, str]:
     """Return the last end of each node that has used up its restarts, by node."""
     return {
-        ident: f"{str(node.exit) or 'ended'} after {_restarts(node.restarts)}"
+        ident: f"{str(node.exit) or 'ended'} after {counted(node.restarts, 'restart')}"
         for ident, node in nodes.items()
         if _is_spent(node)
     }
@@ -379,10 +379,6 @@ def _is_spent(node: NodeStatus) -> bool:
         return is_own and node.policy not in ("never", HELD, LATCHED)
     is_used_up = 0 < node.max_restarts <= node.restarts
     return node.state == "finished" and node.policy == "always" and is_used_up
-
-
-def _restarts(count: int) -> str:
-    return "1 restart" if count == 1 else f"{count} restarts"
 
 
 def apply_results(nodes: NodeTable, results: Mapping[str, Exit], at_us: int) -> NodeTable:

@@ -4,7 +4,7 @@ import re
 from math import inf
 from typing import NamedTuple
 
-from dora_systemd.values import SECOND, format_duration, format_rounded_size
+from dora_systemd.values import SECOND, counted, format_duration, format_rounded_size
 
 WAIT, COPY, CHECK, BUILD = "wait", "copy", "check", "build"
 STOP, START, SOAK, VERDICT, BACK = "stop", "start", "soak", "verdict", "back"
@@ -72,8 +72,8 @@ def copying(done: int, total: int) -> Step:
 
 def copied(files: int, total: int, new: int) -> Step:
     """Return the step of a complete copy. new: bytes that no other release has."""
-    count = f"{files} file{'' if files == 1 else 's'}"
-    text = f"copied: {count}, {format_rounded_size(total)}, {format_rounded_size(new)} of it new"
+    all_bytes, new_bytes = format_rounded_size(total), format_rounded_size(new)
+    text = f"copied: {counted(files, 'file')}, {all_bytes}, {new_bytes} of it new"
     return Step(COPY, text, amount=(total, total), is_last=True)
 
 

@@ -18,6 +18,7 @@ from dora_systemd.decisions.views.formats import (
 from dora_systemd.decisions.views.objects import Shares, dataflow_object, moment
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.terminal_text import cut
+from dora_systemd.values import counted
 
 SORTS = ("cpu", "memory", "name")
 HEADER = ("NAME", "STATE", "UPTIME", "CPU%", "MEM", "PEAK", "RESTARTS", "WAITS FOR")
@@ -142,13 +143,9 @@ def format_summary(look: Look) -> str:
     cpu = sum(row.cpu_percent or 0.0 for row in rows)
     memory = sum(row.memory or 0 for row in rows)
     return (
-        f"{_counted(len(rows), 'dataflow')}, {_counted(nodes, 'node')}, "
+        f"{counted(len(rows), 'dataflow')}, {counted(nodes, 'node')}, "
         f"CPU {cpu:.1f}%, memory {format_memory(memory)}"
     )
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def look_values(look: Look, by: str) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from dora_systemd.decisions.cell.restarts import (
 from dora_systemd.errors import DoraSystemdError, RestartsSpent
 from dora_systemd.names import unit_name
 from dora_systemd.paths import CellPaths, request_file
-from dora_systemd.values import INFINITY, SECOND, format_duration
+from dora_systemd.values import INFINITY, SECOND, counted, format_duration
 
 Hold = Callable[[], Coroutine[Any, Any, None]]
 """Waits until the nodes may start."""
@@ -96,9 +96,8 @@ def find_spent(options: RunnerOptions, paths: CellPaths) -> RestartsSpent | None
     if used <= policy.max_restarts:
         return None
     most, window = policy.max_restarts, format_duration(policy.window)
-    count = "1 automatic restart" if most == 1 else f"{most} automatic restarts"
     hint = f"doractl why {options.name} shows what has failed"
-    return RestartsSpent(f"{count} within {window} did not help", hint)
+    return RestartsSpent(f"{counted(most, 'automatic restart')} within {window} did not help", hint)
 
 
 def _now_us() -> int:
