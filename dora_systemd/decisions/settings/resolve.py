@@ -114,20 +114,30 @@ def resolve_settings(
 
 
 def given_texts(
-    flags: Mapping[str, object], environment: Mapping[str, str], directory: PurePath
+    flags: Mapping[str, object],
+    environment: Mapping[str, str],
+    directory: PurePath,
+    recorded: Mapping[str, object] | None = None,
 ) -> dict[str, str | list[str]]:
     """Return what flags and variables set, as flags that are valid in every directory.
 
-    directory: where relative paths start. Raises DoraSystemdError (USAGE) as resolve_settings().
+    directory: where relative paths start. recorded: flags of lower precedence, of an earlier call.
+    Raises DoraSystemdError (USAGE) as resolve_settings().
     """
     found: dict[str, str | list[str]] = {}
     for setting in SETTINGS:
-        given = [*_from_variable(setting, environment, directory)]
+        given = [*_from_flag(setting, recorded or {})]
+        given += _from_variable(setting, environment, directory)
         given += _from_flag(setting, flags, directory)
         if given:
-            texts = list(setting.kind.format(given[-1][1]))
-            found[setting.name] = texts if setting.kind.is_repeatable else " ".join(texts)
+            texts = list(setting.kind.format(_merged(setting, given)[1]))
+            found[setting.name] = _last(texts) if setting.kind.is_repeatable else " ".join(texts)
     return found
+
+
+def _last(texts: Iterable[str]) -> list[str]:
+    """The texts, each at its last place only: the order of properties counts."""
+    return [*dict.fromkeys(reversed([*texts]))][::-1]
 
 
 def is_given(value: object) -> bool:

@@ -45,19 +45,19 @@ class Asked(NamedTuple):
         return unit_name(self.name)
 
     def request(self, wanted: "StartRequest") -> "StartRequest":
-        """Return the request for the recorded start; flags of `wanted` override recorded ones.
+        """Return the request for the recorded start, with the flags of `wanted` above its own.
 
-        Raises DoraSystemdError (USAGE) for another name.
+        Raises DoraSystemdError (USAGE) for another name, or a wrong flag.
         """
-        from dora_systemd.decisions.settings.resolve import is_given
+        from dora_systemd.decisions.settings.resolve import given_texts, is_given
 
         if wanted.name not in (None, self.name):
             hint = f"doractl start {self.dataflow} --name NAME starts one more"
             raise usage_error(f"cannot start {self.name} as {quoted(wanted.name)}", hint)
-        given = {key: value for key, value in wanted.flags.items() if is_given(value)}
-        flags = {**self.flags, **given}
+        given = frozenset(key for key, value in wanted.flags.items() if is_given(value))
+        flags = given_texts(wanted.flags, {}, current_directory(), self.flags)
         known = wanted._replace(dataflow=self.dataflow, name=self.name, uuid=self.uuid)
-        return known._replace(flags=flags, changed=frozenset(given))
+        return known._replace(flags=flags, changed=given)
 
 
 def means_name(text: str) -> bool:

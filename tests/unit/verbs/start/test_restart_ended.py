@@ -73,10 +73,12 @@ def test_the_last_start(text: str, journal: FakeJournal) -> None:
     found = find_start(FakeManager(), SCOPE, Selector(text))
     assert isinstance(found, Asked)
     assert found == Asked("robot", UUID, "/srv/robot.yml", KEPT)
-    wanted = StartRequest(text, flags={"env": ("C=3",), "debug": None, "writable": ()})
+    given = {"env": ("C=3", "B=4"), "debug": None, "writable": (), "memory_limit": "2G"}
+    wanted = StartRequest(text, flags=given)
     again = found.request(wanted)
     assert (again.dataflow, again.name, again.uuid) == ("/srv/robot.yml", "robot", UUID)
-    assert again.flags == {**KEPT, "env": ("C=3",)}
+    assert again.flags == {**KEPT, "env": ["A=1", "B=4", "C=3"], "memory_limit": "2G"}
+    assert again.changed == {"env", "memory_limit"}
     with pytest.raises(DoraSystemdError, match="cannot start robot as 'x'"):
         found.request(StartRequest(text, "x"))
 
@@ -130,6 +132,25 @@ def test_a_journal_that_cannot_be_read(journal: FakeJournal) -> None:
     journal.complain("No journal files were opened due to insufficient permissions.")
     with pytest.raises(DoraSystemdError, match="no dataflow named 'robot'"):
         find_start(FakeManager(), SCOPE, Selector("robot"))
+
+
+def test_settings_of_nodes_and_lists_are_added_to_those_of_the_last_start() -> None:
+    recorded = {
+        "nodes": ("cam:memory_limit=1G", "cam:cpu_limit=1"),
+        "writable": ("/a", "/b"),
+        "property": ("LimitNOFILE=5", "LimitNOFILE=6"),
+    }
+    given = {
+        "nodes": ("arm:memory_limit=2G", "cam:cpu_limit=2"),
+        "writable": ("/a", "/c"),
+        "property": ("LimitNOFILE=5",),
+    }
+    found = Asked("robot", UUID, "/srv/robot.yml", recorded)
+    assert found.request(StartRequest("robot", flags=given)).flags == {
+        "nodes": ["cam:memory_limit=1G", "cam:cpu_limit=200%", "arm:memory_limit=2G"],
+        "writable": ["/b", "/a", "/c"],
+        "property": ["LimitNOFILE=6", "LimitNOFILE=5"],
+    }
 
 
 @pytest.mark.parametrize(
