@@ -52,6 +52,7 @@ TOLERATED = (
     Word("for unknown Query", _SLOW),
     Word("for unknown Request", _SLOW),
     Word("event channel full", _SLOW),
+    Word("event channel low on capacity", _SLOW),
     Word("closing node connection after I/O error", _ENDING),
     Word("server disconnected unexpectedly", _ENDING),
     Word("failed to report outputs done to dora-daemon", _ENDING),
