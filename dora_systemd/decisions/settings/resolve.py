@@ -131,7 +131,8 @@ def given_texts(
         given += _from_flag(setting, flags, directory)
         if given:
             texts = list(setting.kind.format(_merged(setting, given)[1]))
-            found[setting.name] = _last(texts) if setting.kind.is_repeatable else " ".join(texts)
+            many = _last(texts) if recorded else texts
+            found[setting.name] = many if setting.kind.is_repeatable else " ".join(texts)
     return found
 
 

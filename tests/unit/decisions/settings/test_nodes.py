@@ -58,6 +58,8 @@ def test_what_a_deploy_records() -> None:
     recorded = given_texts({"nodes": texts}, {}, PurePath("/srv"))["nodes"]
     assert recorded == ["a:cpu_limit=150%", "a:owes=image:within=2s,first=30s,then=restart"]
     assert given(*recorded) == given(*texts)
+    twice = ["ExecStartPre=/bin/a", "ExecStartPre=/bin/a"]
+    assert given_texts({"property": twice}, {}, PurePath("/srv"))["property"] == twice
 
 
 @pytest.mark.parametrize(
