@@ -23,6 +23,10 @@ from lab.process import die_with_parent
 
 # pytest's last line: "=== 3 passed, 1 skipped in 0.12s ==="
 SUMMARY = re.compile(r"=+ (\d+ .* in [\d.:s ()]+) =+")
+# The name of a test that failed, and a line that shows why.
+TEST = re.compile(r"_{2,} (.+) _{2,}")
+WHY = re.compile(r"E   +\S.*|(FAILED|ERROR) \S.*")
+WHY_OF_A_TEST, WHY_OF_A_STEP = 8, 30
 COUNTS = ("failed", "passed", "skipped", "error")
 IMAGES_MINUTES = 8
 LOOK_SECONDS = 0.2
@@ -47,12 +51,13 @@ class Step:
 @dataclass(frozen=True)
 class Result:
     """How a step ended. summary: pytest's, or "done". cpu: seconds of processor time, of all that
-    it has started and waited for, and of its containers."""
+    it has started and waited for, and of its containers. faults: lines about what failed."""
 
     name: str
     status: int
     summary: str
     cpu: float = 0.0
+    faults: tuple[str, ...] = ()
 
 
 def run_steps(steps: Sequence[Step]) -> int:
@@ -110,11 +115,17 @@ def say_plan(steps: Sequence[Step]) -> None:
 
 
 def say_results(results: Sequence[Result], seconds: float) -> None:
-    """One line for each step, and one for all, as pytest writes it."""
+    """One line for each step, what failed, and one line for all, as pytest writes it.
+
+    A CI may show only the end of a long output.
+    """
     for result in results:
         word = f"FAILED with exit status {result.status}" if result.status else "ok"
         used = f"{result.cpu:.0f} s of processor time"
         say(f"{result.name}: {word}; {result.summary}; {used}")
+    for result in results:
+        for line in result.faults:
+            say(f"{result.name}: {line}")
     sys.stderr.flush()
     print(f"===== {total(results)} in {seconds:.2f}s =====", flush=True)
 
@@ -176,16 +187,18 @@ class Running:
 
     def finish(self) -> Result:
         """How it ended, when it has ended and all is shown. Raises LabError."""
-        summary, line = "done", ""
+        summary, line, faults = "done", "", Faults()
         for part in self._parts():
             print(part, end="", flush=True)
             line += part
             if line.endswith("\n"):
+                faults.read(line.rstrip())
                 summary, line = read_summary(line) or summary, ""
         if self._error:
             raise self._error
         status = self._status
-        return Result(self.step.name, status if status >= 0 else 128 - status, summary, self._cpu)
+        status = status if status >= 0 else 128 - status
+        return Result(self.step.name, status, summary, self._cpu, faults.found if status else ())
 
     def _parts(self) -> Iterator[str]:
         """What it prints, as it comes: lines, and beginnings of lines."""
@@ -198,6 +211,28 @@ class Running:
             while not has_ended:
                 has_ended = self._has_ended.wait(LOOK_SECONDS)
                 yield from shown
+
+
+class Faults:
+    """Which tests failed and why, of the lines that pytest prints."""
+
+    def __init__(self) -> None:
+        self._found: list[str] = []
+        self._test = ""
+        self._left = 0
+
+    @property
+    def found(self) -> tuple[str, ...]:
+        return tuple(self._found[-WHY_OF_A_STEP:])
+
+    def read(self, line: str) -> None:
+        """Take a line. Only the first lines about a test are kept."""
+        if named := TEST.fullmatch(line):
+            self._test, self._left = named[1], WHY_OF_A_TEST
+        elif (why := WHY.fullmatch(line)) and (self._left or why[1]):
+            self._found += [self._test] if self._test else []
+            self._found.append(line)
+            self._test, self._left = "", max(self._left - 1, 0)
 
 
 def read_summary(line: str) -> str:

@@ -180,6 +180,40 @@ def test_one_summary_for_all(results: list[tuple[int, str]], words: str) -> None
     assert total([Result("one", *given) for given in results]) == words
 
 
+PYTEST_PRINTS = """\
+_____________________ test_one[a] _____________________
+    def test_one():
+>       assert f() == 2
+E       assert 1 == 2
+{more}
+___________ ERROR at teardown of test_two ____________
+E   AssertionError: unexpected warning
+=============== short test summary info ===============
+FAILED tests/test_x.py::test_one[a] - assert 1 == 2
+ERROR tests/test_x.py::test_two - AssertionError
+============== 1 failed, 1 error in 1.00s ==============
+"""
+
+
+def test_what_failed_is_shown_at_the_end(capfd: pytest.CaptureFixture[str]) -> None:
+    text = PYTEST_PRINTS.format(more="E         more\n" * 20)
+    fails = Step("bad", ["sh", "-c", 'printf %s "$0"; exit 1', text], os.environ.copy)
+    run_steps([fails, replace(fails, name="fine", command=["echo", text])])
+    said = capfd.readouterr().err.split("s of processor time\n")[-1]
+    assert said.splitlines() == [
+        f"lab: bad: {line}"
+        for line in (
+            "test_one[a]",
+            "E       assert 1 == 2",
+            *["E         more"] * 7,
+            "ERROR at teardown of test_two",
+            "E   AssertionError: unexpected warning",
+            "FAILED tests/test_x.py::test_one[a] - assert 1 == 2",
+            "ERROR tests/test_x.py::test_two - AssertionError",
+        )
+    ]
+
+
 def test_all_steps_run_and_the_worst_status_counts(capfd: pytest.CaptureFixture[str]) -> None:
     scripts = ["echo one", "echo '== 2 failed, 1 passed in 1.00s =='; exit 1", "kill -TERM $$"]
     steps = [
