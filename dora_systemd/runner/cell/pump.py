@@ -1,9 +1,9 @@
 """The runner's event pump: it takes events through the table of decisions/life/.
 
 The pump holds the Cell, the whole state of one run. push() passes an event to step(), stores the
-new cell, publishes it (STATUS=, READY=1, the status file that `list` reads), and then performs the
-actions of the step, in their order. A Do calls what connect() was given, mostly a method of
-Dialogue; a Record writes a life event; a Deadline replaces the timer.
+new cell, publishes it (STATUS=, the status file that `list` reads), performs the actions of the
+step, in their order, and sends READY=1 when it is due. A Do calls what connect() was given, mostly
+a method of Dialogue; a Record writes a life event; a Deadline replaces the timer.
 
 The pump relies on the event loop's thread: everything here runs in it and must not block. Actions
 can push events, so push() queues them while it handles another one. Two things would break the
@@ -94,6 +94,7 @@ class Pump:
         self._actions = actions
         self._set_deadline(ENGINE_TIMEOUT)
         self._publish()
+        self._announce()
 
     def push(self, event: life.Event) -> None:
         """Take one event through the table, then the events that its actions push.
@@ -124,6 +125,8 @@ class Pump:
         for action in actions:
             with self._guard(_name(action)):
                 self._perform(action)
+        with self._guard("report that it is up"):
+            self._announce()
         with self._guard("request a notice"):
             self.on_change(event, before, self.cell)
         if self.cell.state is State.ENDED and not self.end.done():
@@ -207,13 +210,15 @@ class Pump:
         if text != self._text:
             self._text = text
             notify.send_status(text)
-        becomes_ready = not self._is_ready and is_up(self.cell)
-        if becomes_ready:
-            self._is_ready = True
+        if is_up(self.cell):
             self._life.become_up()
-        # The table comes first: a client that waited for READY=1 may read it at once.
         self._write_table()
-        if becomes_ready:
+
+    def _announce(self) -> None:
+        # Last: a client that waited for READY=1 may read the table and the life events at once, and
+        # may write an event that must follow "dataflow-started".
+        if not self._is_ready and is_up(self.cell):
+            self._is_ready = True
             notify.send_ready()
 
     def sample(self) -> bool:

@@ -225,22 +225,22 @@ def test_a_stop_before_it_is_ready_ends_as_a_start_that_went_well(
     live(work)
 
 
-def test_the_table_is_there_before_anybody_hears_that_it_runs(
+def test_the_table_and_the_event_are_there_before_systemd_reports_that_it_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tables: dict[str, str] = {}
+    seen: dict[str, tuple[str, bool]] = {}
 
     async def work() -> None:
         bench = Bench(tmp_path, State.WAITING, ready_us=0)
-        table = bench.paths.status
 
         def notify(text: str) -> None:
-            tables[text] = json.loads(table.read_text())["stage"]
+            has_event = ("event", "dataflow-started") in bench.calls
+            seen[text] = bench.table["stage"], has_event
 
         monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere")
         install(monkeypatch, "systemd.daemon", notify=notify)
         bench.push(life.AllReady(5))
-        assert tables["READY=1"] == "running"
+        assert seen["READY=1"] == ("running", True)
 
     live(work)
 
