@@ -211,10 +211,12 @@ class Roster:
             self._lose(name, why, lines.is_broken)
 
     def _replace(self, name: str, lines: Lines) -> None:
-        if (old := self._members[name].lines) is not None:
-            self._lose(name, "it has a new link")
+        member = self._members[name]
+        if (old := member.lines) is not None:
+            # A link that tries again is no reason why a member is not ready: the first one stays.
+            self._lose(name, "it has a new link" if member.work else member.words)
             old.end("there is a new link")
-        self._members[name].lines, self._members[name].is_over = lines, False
+        member.lines, member.is_over = lines, False
 
     def _send_part(self, name: str) -> None:
         lines, options = self._members[name].lines, self._options

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.machines import Placed, format_missing, is_news
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -301,6 +301,19 @@ def test_a_refusal_has_its_hint() -> None:
         assert event.reason.startswith("machine gpu: no")
         assert event.reason.endswith("; hint: copy it")
         assert "\x1b" not in event.reason
+
+    run(work)
+
+
+def test_a_link_that_tries_again_is_no_reason() -> None:
+    """A slow head sees the second attempt before the end of the first one."""
+
+    async def work(bench: Bench) -> None:
+        await bench.link()
+        before = bench.roster.missing()
+        await bench.link()
+        assert bench.roster.missing() == before
+        assert not is_news(f"waiting for {format_missing(before)}")
 
     run(work)
 
