@@ -42,8 +42,11 @@ def _size(value: object, source: str) -> int:
         return 20
     if isinstance(value, float) and math.isfinite(value):
         return 20
-    if isinstance(value, int | float):
+    if isinstance(value, int):
         raise refusal(source, "a number in it is too large for JSON", "write it as text")
+    if isinstance(value, float):
+        kind = "not a number (.nan)" if math.isnan(value) else "infinite (.inf)"
+        raise refusal(source, f"a value in it is {kind}", "write a finite number")
     kind = type(value).__name__
     raise refusal(source, f"a value in it is of type {kind}", "write plain text or a number")
 
