@@ -21,6 +21,10 @@ LISTENING = "Listening on port "
 """What a coordinator prints before its port, once it has written its token."""
 _PORT = rf"(?m)^{LISTENING}(\d+)\n".encode()
 _CHUNK = 4096
+_FLAGS = 6
+"""Field of /proc/PID/stat behind the name, from 0."""
+_PF_EXITING = 0x4
+"""From include/linux/sched.h of Linux."""
 
 
 def coordinator_command(dora: str, port: int = 0) -> list[str]:
@@ -60,6 +64,17 @@ class Child(NamedTuple):
     pidfd: int
     output: int  # read end of its stdout and stderr
     said: bytearray  # the output so far
+
+    def is_exiting(self) -> bool:
+        """Return whether the exit has begun, a moment before the pidfd can be read.
+
+        The kernel sets the flag PF_EXITING before it closes the connections of the process, see
+        proc_pid_stat(5).
+        """
+        if self.popen.returncode is not None:
+            return True
+        stat = Path(f"/proc/{self.popen.pid}/stat").read_bytes()
+        return bool(int(stat.rpartition(b")")[2].split()[_FLAGS]) & _PF_EXITING)
 
     def send_signal(self, number: signal.Signals) -> None:
         """Send the child a signal, but never another process that has reused its pid."""

@@ -6,6 +6,7 @@ becomes an event of the pump, and so does every exception.
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -31,7 +32,10 @@ from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
 _SETTLE_SECONDS = 0.02
-"""Time for the exit of a child to be seen, which explains a connection that is lost."""
+"""Time for a child that closes its connections to begin its exit."""
+_EXIT_SECONDS = 5.0
+"""Time for an exit that has begun: the kernel closes connections first, and a machine can be busy.
+"""
 _TURNS = 5
 """Turns of the event loop that receive a signal to the runner before the exit of a child: one turn
 reads the signal, the next handles it. `systemctl kill` signals all processes of the cell, the
@@ -103,9 +107,17 @@ class Dialogue(Tasks):
             event = life.Refused(now_us(), error.message)
         else:
             event = failed(what, error)
-        # If a child is exiting, let ChildExited come first: it explains a lost connection.
-        await asyncio.sleep(_SETTLE_SECONDS)
+        await self._let_exit_come()
         self._pump.push(event)
+
+    async def _let_exit_come(self) -> None:
+        """Return after ChildExited if a child is exiting: that explains a lost connection."""
+        before = self._pump.cell.state
+        await asyncio.sleep(_SETTLE_SECONDS)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_EXIT_SECONDS):
+                while self._engine.is_exiting() and self._pump.cell.state is before:
+                    await asyncio.sleep(_SETTLE_SECONDS)
 
     def watch(self, child: engine.Child, on_line: Callable[[str], None] | None = None) -> None:
         """Read the output of a child process, and report its exit."""
@@ -162,7 +174,7 @@ class Dialogue(Tasks):
             self._pump.push(life.Subscribed(now_us()))
 
         await self._engine.read_events(self._pump.cell.run, subscribed, self._hear)
-        await asyncio.sleep(2 * _SETTLE_SECONDS)  # let ChildExited of the coordinator come first
+        await self._let_exit_come()
         self._events_ended()
 
     def _events_ended(self) -> None:

@@ -158,6 +158,10 @@ class Engine:
             on_start()
             await connection.read_events(on_record)
 
+    def is_exiting(self) -> bool:
+        """Return whether coordinator or daemon has exited or is exiting."""
+        return any(child.is_exiting() for child in self._children.values())
+
     def dismiss_daemon(self) -> bool:
         """Have the daemon exit properly; False if it has exited already."""
         daemon = self._children.get("daemon")

@@ -192,6 +192,7 @@ class FakeDora(Engine):
         self.silent = ""
         self.hangs = False
         self.has_daemon = True
+        self.exits = False
         self.daemon: Callable[[Mapping[str, str]], Child] | None = None
 
     def set_port(self, port: int) -> None:
@@ -203,6 +204,9 @@ class FakeDora(Engine):
 
     async def wait_joined(self) -> None:
         await self.joined.wait()
+
+    def is_exiting(self) -> bool:
+        return self.exits
 
     async def find_silent(self, seconds: float) -> str:
         self.calls.append(("find silent", seconds))

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -56,6 +57,17 @@ def test_children_and_their_ends(tmp_path: Path) -> None:
     with os.fdopen(child.output) as output:
         assert output.read() == "out\nerr\n"
     assert child.popen.wait() == 3
+
+
+def test_a_child_that_exits(tmp_path: Path) -> None:
+    child = engine.spawn("a) b", ["/bin/sleep", "1000"], {}, tmp_path)
+    os.close(child.output)
+    assert not child.is_exiting()
+    child.send_signal(signal.SIGKILL)
+    os.waitid(os.P_PID, child.popen.pid, os.WEXITED | os.WNOWAIT)
+    assert child.is_exiting(), "nobody has waited for it"
+    child.popen.wait()
+    assert child.is_exiting(), "somebody has"
 
 
 def test_a_program_that_is_not_there(tmp_path: Path) -> None:

@@ -85,6 +85,40 @@ def test_the_end_of_a_child_comes_before_what_its_connection_suffers(tmp_path: P
     live(work)
 
 
+@pytest.mark.parametrize("what", ["Start", "the events end"])
+def test_an_exit_that_has_begun_explains_a_connection_that_is_lost(
+    tmp_path: Path, what: str
+) -> None:
+    """The kernel closes the connections of a killed process before it reports the end."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.exits = True
+        bench.dora.answers["Start"].append(DoraSystemdError("it closed the connection"))
+        bench.dora.closed.set()
+        bench.actions[Do.SEND_START if what == "Start" else Do.SUBSCRIBE]()
+        await asyncio.sleep(1)
+        kinds = [type(event) for event in bench.heard]
+        assert kinds == ([] if what == "Start" else [life.Subscribed])
+        bench.enter(State.ENDED)  # by ChildExited
+        await asyncio.sleep(1)
+        assert len(bench.heard) == len(kinds) + 1
+
+    live(work)
+
+
+def test_an_exit_that_takes_long_is_not_awaited_for_ever(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.exits = True
+        bench.dora.answers["Start"].append(DoraSystemdError("it closed the connection"))
+        bench.actions[Do.SEND_START]()
+        await asyncio.sleep(10)
+        assert bench.heard == [life.Refused(0, "it closed the connection")]
+
+    live(work)
+
+
 @pytest.mark.parametrize(
     ("error", "heard"),
     [
