@@ -150,6 +150,13 @@ def age() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) - int(start) / os.sysconf("SC_CLK_TCK")
 
 
+def began_us() -> int:
+    """Return when systemd began this process, in µs of CLOCK_REALTIME."""
+    seconds = age()
+    # Read last: between the two clocks a busy machine would do other things for a while.
+    return time.time_ns() // 1000 - int(seconds * SECOND)
+
+
 def asked(what: str, name: str, is_user: bool, otherwise: int) -> int:
     """Read a number that systemd has of the unit.
 
@@ -209,8 +216,7 @@ def is_first_life(policy: RestartPolicy, name: str, is_user: bool) -> bool:
         return True
     if not fd_store.is_first_life():
         return False
-    began = time.time_ns() // 1000 - int(age() * SECOND)
-    return 0 <= began + _TICK - written_us(_transient(name, is_user)) < policy.unit_delay
+    return 0 <= began_us() + _TICK - written_us(_transient(name, is_user)) < policy.unit_delay
 
 
 def is_transient(name: str, is_user: bool) -> bool:

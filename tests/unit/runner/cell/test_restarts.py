@@ -26,6 +26,7 @@ from dora_systemd.runner.cell.restarts import (
     Life,
     age,
     asked,
+    began_us,
     begin_hold,
     begin_life,
     find_spent,
@@ -416,7 +417,7 @@ def unit_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "systemd/transient/dora-robot.service"
     path.parent.mkdir(parents=True)
     path.touch()
-    os.utime(path, (time.time() - age() - 0.1,) * 2)
+    os.utime(path, (began_us() / SECOND - 0.1,) * 2)
     return path
 
 
@@ -493,7 +494,7 @@ def test_only_a_start_that_was_just_queued_is_the_first(
     unit_file: Path, after: float, is_first: bool
 ) -> None:
     """systemd writes the file then, before the process begins; a restart comes after its delay."""
-    os.utime(unit_file, (time.time() - age() + after,) * 2)
+    os.utime(unit_file, (began_us() / SECOND + after,) * 2)
     assert is_first_life(ON_FAILURE, "robot", is_user=True) == is_first
 
 
