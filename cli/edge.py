@@ -86,19 +86,23 @@ def with_target(text: str, host: str, scope: str = "") -> str:
     if not (host or scope) or "doractl " not in text:
         return text
     verbs = "|".join(VERBS)
-    command = rf"(\bby \S+ \(|\bon \S+: |\bsudo )?\bdoractl (?:(--system|--user) )?((?:{verbs})\b)"
+    command = (
+        r"(\bby \S+ \(|\bon \S+: |\bsudo )?\bdoractl (?:(--system|--user) )?"
+        rf"((?:{verbs})\b(?: (?:--system|--user)\b)?)"
+    )
 
     def there(found: re.Match[str]) -> str:
         before, given, verb = found.groups("")
         if before.startswith("by "):  # as in "stopped by root (doractl stop)": stays
             return found[0]
-        # With sudo the scope is the system's.
-        words = [given or ("" if before == "sudo " else scope), verb]
+        # With sudo the scope is the system's; in "doractl list --system" it is behind the verb.
+        has_scope = before == "sudo " or " " in verb
+        words = [given or ("" if has_scope else scope), verb]
         if host and not before.startswith(
             "on "
         ):  # as in "on head: doractl stop": to be typed there
             # What env prints leads to 127.0.0.1 there, so -H refuses env.
-            words = [*words, "on", host] if verb == "env" else ["-H", host, *words]
+            words = [*words, "on", host] if verb.split()[0] == "env" else ["-H", host, *words]
         return " ".join([f"{before}doractl", *filter(None, words)])
 
     return re.sub(command, there, text)

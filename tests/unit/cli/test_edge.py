@@ -37,6 +37,8 @@ def test_commands_are_for_the_host_they_are_about(text: str, there: str | None) 
         ("stopped by root (doractl stop)", "stopped by root (doractl stop)"),
         ("see doractl env", "see doractl --system env"),
         ("on head: doractl stop x", "on head: doractl --system stop x"),
+        ("1 (doractl list --user)", "1 (doractl list --user)"),
+        ("1 (doractl list --all)", "1 (doractl --system list --all)"),
     ],
 )
 def test_commands_are_in_the_scope_they_are_about(text: str, there: str) -> None:
