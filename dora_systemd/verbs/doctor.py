@@ -24,6 +24,7 @@ from dora_systemd.adapters.host.rivals import Interrupts
 from dora_systemd.adapters.host.unit_files import read_unit_file
 from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN, core_program
+from dora_systemd.decisions.settings.table import USER
 from dora_systemd.decisions.unit.file import BOOT_TARGET, runner_of
 from dora_systemd.decisions.views.diagnosis import (
     DORA_PORTS,
@@ -64,9 +65,9 @@ from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.logins import PASSWD, is_lingering, judge_logins, linger_command
 from dora_systemd.verbs.start.programs import unreadable_file, version_trouble_of
-from dora_systemd.verbs.start.read import config_files
+from dora_systemd.verbs.start.read import config_files, has_settings
 from dora_systemd.verbs.start.settings import check_config
-from dora_systemd.verbs.start.where import DEFAULT_USER
+from dora_systemd.verbs.start.where import DEFAULT_USER, named_user
 
 JOURNALD = "systemd-journald.service"
 
@@ -356,13 +357,15 @@ def _user(scope: Scope, _root: Path) -> Iterator[Finding]:
 def _settings(scope: Scope, root: Path) -> Iterator[Finding]:
     """Check the settings files for all dataflows; `start` checks the one next to a dataflow."""
     for path in (_below(root, one) for one in config_files(os.environ)):
-        if exists(path):
-            try:
-                check_config(scope, path)
-            except DoraSystemdError as error:
-                yield Finding("settings", State.PROBLEM, error.message, error.hint)
-            else:
-                yield Finding("settings", State.OK, f"{path} can be read")
+        try:
+            if not has_settings(path):
+                continue
+            settings = check_config(scope, path)
+            named_user(scope, settings[USER], settings.source(USER))
+        except DoraSystemdError as error:
+            yield Finding("settings", State.PROBLEM, error.message, error.hint)
+        else:
+            yield Finding("settings", State.OK, f"{path} can be read")
 
 
 def _processes(_scope: Scope, root: Path) -> Iterator[Finding]:

@@ -97,15 +97,15 @@ def read_beside(dataflow: Path, origin: Place | None = None) -> SettingsFile | N
     file that was copied with it.
     """
     path = Path(settings_path(str(dataflow)))
-    return read_settings_file(path, origin) if _is_there(path) else None
+    return read_settings_file(path, origin) if has_settings(path) else None
 
 
 def read_general(environment: Mapping[str, str]) -> tuple[SettingsFile, ...]:
     """The settings files for all dataflows, highest precedence first. Raises DoraSystemdError."""
-    return tuple(read_settings_file(one) for one in config_files(environment) if _is_there(one))
+    return tuple(read_settings_file(one) for one in config_files(environment) if has_settings(one))
 
 
-def _is_there(path: Path) -> bool:
+def has_settings(path: Path) -> bool:
     """Whether a settings file is at `path`.
 
     Raises DoraSystemdError (BAD_INPUT) for a link that leads nowhere: without the file the limits

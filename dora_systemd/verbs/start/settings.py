@@ -83,12 +83,12 @@ def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
     return _resolved(found)
 
 
-def check_config(scope: Scope, path: Path) -> None:
-    """Raise DoraSystemdError for a settings file with which no dataflow would start."""
+def check_config(scope: Scope, path: Path) -> Settings:
+    """Return the settings of a file. Raises DoraSystemdError if no dataflow would start with it."""
     read = read_settings_file(path)
     if not scope.is_user and not read.is_roots:
         require_modest(read)
-    _resolved([read])
+    return _resolved([read])
 
 
 def require_modest(read: SettingsFile) -> None:

@@ -263,16 +263,9 @@ def choose_user(
     Default: the owner of the dataflow file that was read, or DEFAULT_USER if that is root.
     directory: that of the programs. source: of `wanted`, as of Settings. Raises DoraSystemdError.
     """
-    if scope.is_user:
-        if wanted is not None:
-            raise _not_usable(
-                "cannot choose the user of a dataflow with --user",
-                f"leave {_key(source)} out, or use --system as root",
-                source,
-            )
-        return None
-    if wanted is not None:
-        return _entry(wanted, source)
+    named = named_user(scope, wanted, source)
+    if scope.is_user or named is not None:
+        return named
     try:
         with reached(directory) as (_, place):
             check_identity(dataflow, place)
@@ -281,6 +274,22 @@ def choose_user(
         # refused. The text is that of Look.check_reach(), which does not reveal what root can see.
         raise no_directory(directory) from error
     return _default_entry() if dataflow.uid == 0 else _owner_entry(dataflow.uid, dataflow.path)
+
+
+def named_user(scope: Scope, wanted: str | None, source: str) -> pwd.struct_passwd | None:
+    """The user that a flag or a settings file names, if one does.
+
+    source: of `wanted`, as of Settings. Raises DoraSystemdError.
+    """
+    if wanted is None:
+        return None
+    if scope.is_user:
+        raise _not_usable(
+            "cannot choose the user of a dataflow with --user",
+            f"leave {_key(source)} out, or use --system as root",
+            source,
+        )
+    return _entry(wanted, source)
 
 
 def no_directory(directory: str) -> DoraSystemdError:

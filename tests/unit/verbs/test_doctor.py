@@ -312,6 +312,27 @@ def test_a_half_written_settings_file(manager: FakeManager, scope: Scope, config
     assert "settings" not in found(manager, scope)
 
 
+def test_a_settings_file_that_leads_nowhere(
+    manager: FakeManager, scope: Scope, config: Path
+) -> None:
+    config.symlink_to("gone.yml")
+    finding = found(manager, scope)["settings"]
+    assert finding.state is State.PROBLEM
+    assert finding.text == f"cannot read {config}: it is a link that leads to no readable file"
+
+
+def test_a_settings_file_with_a_user_that_no_start_can_have(
+    manager: FakeManager, scope: Scope, config: Path
+) -> None:
+    config.write_text("user: 4000000000\n")
+    finding = found(manager, scope)["settings"]
+    assert finding.state is State.PROBLEM
+    fault = (
+        "choose the user of a dataflow with --user" if scope.is_user else "find a user '4000000000'"
+    )
+    assert finding.text == f"cannot {fault} (user in {config})"
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs a file of somebody else")
 def test_a_settings_file_that_root_would_not_believe(
     manager: FakeManager, scope: Scope, config: Path

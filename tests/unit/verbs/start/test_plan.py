@@ -4,6 +4,7 @@ import os
 import pwd
 import signal
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -318,8 +319,11 @@ def test_a_settings_file_that_others_can_write(
     if not is_refused:
         check_config(SYSTEM, beside)
         return
-    for read in (lambda: settings(SYSTEM, project / "robot.yml"),
-                 lambda: check_config(SYSTEM, beside)):  # fmt: skip
+    readers: tuple[Callable[[], object], ...] = (
+        lambda: settings(SYSTEM, project / "robot.yml"),
+        lambda: check_config(SYSTEM, beside),
+    )
+    for read in readers:
         with pytest.raises(DoraSystemdError) as caught:
             read()
         assert caught.value.message == (
