@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.errors import ExitCode
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.releases.soak import START_LIMIT
 from tests.system.cells import Project, run, wait_for
@@ -58,6 +59,9 @@ def test_a_release_runs_and_is_not_what_it_was_copied_from(
     cell.doractl("rollback", cell.name)
     assert (releases.current(), releases.running()) == (first, first)
     assert list(releases.states().values()) == ["rolled-back", "current"]
+    words = "doractl", "--system", "releases", cell.name, "--history"
+    other = run("runuser", "-u", "alice", "--", *words, check=False)
+    assert (other.returncode, "hint: use sudo" in other.stderr) == (ExitCode.NO_PERMISSION, True)
     assert f"Release:  {first}" in cell.doractl("list", cell.name).stdout
     changed = cell.doractl("deploy", str(flow), "--name", cell.name, "--dry-run").stdout
     assert changed == "~ a.py\n", "it differs from what runs, and not from the newest one"

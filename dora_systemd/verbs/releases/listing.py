@@ -20,7 +20,7 @@ from dora_systemd.decisions.releases.past import (
 )
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.decisions.views.releases import ReleaseRow
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import list_directory
@@ -76,9 +76,17 @@ def read_releases(manager: Manager, scope: Scope, names: Sequence[str]) -> list[
 
 
 def read_history(manager: Manager, scope: Scope, name: str) -> list[Switch]:
-    """Read the changes of a dataflow's release, newest first. Raises DoraSystemdError."""
+    """Read the changes of a dataflow's release, newest first.
+
+    Raises DoraSystemdError, with NO_PERMISSION for another user's releases.
+    """
     current = read_standing(manager, scope, unit_name(name)).current
-    return read_past(store_of(scope, name), current)[::-1]
+    try:
+        return read_past(store_of(scope, name), current)[::-1]
+    except DoraSystemdError as error:
+        if not isinstance(error.__cause__, PermissionError):
+            raise
+        raise DoraSystemdError(error.message, "use sudo", ExitCode.NO_PERMISSION) from error
 
 
 def _row(store: Store, standing: Standing | None, one: Known, past: Sequence[Switch]) -> ReleaseRow:
