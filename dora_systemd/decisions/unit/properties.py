@@ -40,7 +40,7 @@ from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.sandbox import credential_properties
 from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
-from dora_systemd.errors import DoraSystemdError, usage_error
+from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import SLICE, notice_hold_unit, notice_unit, release_of, unit_description
 from dora_systemd.scope import NOTICE_NAME, RUNTIME_NAME
 from dora_systemd.values import INFINITY, SECOND, quoted
@@ -101,8 +101,9 @@ def unit_properties(
     try:
         return with_assignments(properties, assignments, context.newer)
     except DoraSystemdError as error:
-        message = f"{error.message} ({settings.source(PROPERTY)})"
-        raise DoraSystemdError(message, error.hint, error.code) from error
+        source = settings.source(PROPERTY)
+        code = ExitCode.BAD_INPUT if source.startswith("/") else error.code
+        raise DoraSystemdError(f"{error.message} ({source})", error.hint, code) from error
 
 
 def format_unit(properties: Properties) -> str:

@@ -150,6 +150,15 @@ def test_what_is_ours_is_refused() -> None:
         unit("KillMode=process")
 
 
+def test_a_wrong_property_of_a_file_is_a_fault_of_the_file() -> None:
+    document = {"property": {"Nice": "much"}}
+    settings = resolve_settings({}, {}, [("/srv/robot.systemd.yml", document)])
+    with pytest.raises(DoraSystemdError) as caught:
+        unit_properties(OPTIONS, SYSTEM, settings)
+    assert caught.value.code == ExitCode.BAD_INPUT
+    assert caught.value.message.endswith("to 'much' (/srv/robot.systemd.yml)")
+
+
 def test_a_bad_environment_is_refused() -> None:
     with pytest.raises(DoraSystemdError, match="NOTIFY_SOCKET"):
         unit(context=UnitContext("/usr/bin/python3", False, None, {"NOTIFY_SOCKET": "/x"}))
