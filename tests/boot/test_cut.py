@@ -4,13 +4,15 @@ import os
 from pathlib import Path
 
 from tests.boot.flows import NOTES
-from tests.system.cells import run
+from tests.system.cells import run, wait_for
 
-UNIT = """
-[Unit]
-DefaultDependencies=no
+READY = Path("/run/power-cut")
+# It runs already, and systemd stops it as the first thing of the reboot, with the dataflows: a
+# process that the reboot has to start may come when a slow machine has stopped everything.
+UNIT = f"""
 [Service]
-ExecStart=/bin/sh -c 'echo 1 >/proc/sys/kernel/sysrq; echo b >/proc/sysrq-trigger'
+ExecStart=/bin/sh -c 'echo 1 >/proc/sys/kernel/sysrq; trap "echo b >/proc/sysrq-trigger" TERM; \\
+    touch {READY}; while :; do sleep 1000 & wait; done'
 """
 
 
@@ -20,8 +22,7 @@ def test_prepare() -> None:
         with path.open("rb") as file:
             os.fsync(file.fileno())
     run("journalctl", "--sync")
-    units = Path("/run/systemd/system")
-    (units / "reboot.target.d").mkdir(parents=True)
-    (units / "reboot.target.d/cut.conf").write_text("[Unit]\nWants=power-cut.service\n")
-    (units / "power-cut.service").write_text(UNIT)
+    Path("/run/systemd/system/power-cut.service").write_text(UNIT)
     run("systemctl", "daemon-reload")
+    run("systemctl", "start", "power-cut.service")
+    wait_for("the shell that waits", READY.exists)
