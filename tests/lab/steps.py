@@ -24,7 +24,7 @@ from lab.process import die_with_parent
 # pytest's last line: "=== 3 passed, 1 skipped in 0.12s ==="
 SUMMARY = re.compile(r"=+ (\d+ .* in [\d.:s ()]+) =+")
 # The name of a test that failed, and a line that shows why.
-TEST = re.compile(r"_{2,} (.+) _{2,}")
+TEST = re.compile(r"_+ (.+) _+")
 WHY = re.compile(r"E   +\S.*|(FAILED|ERROR) \S.*")
 WHY_OF_A_TEST, WHY_OF_A_STEP = 8, 30
 COUNTS = ("failed", "passed", "skipped", "error")

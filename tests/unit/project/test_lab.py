@@ -186,7 +186,7 @@ _____________________ test_one[a] _____________________
 >       assert f() == 2
 E       assert 1 == 2
 {more}
-___________ ERROR at teardown of test_two ____________
+_ ERROR at teardown of test_two _
 E   AssertionError: unexpected warning
 =============== short test summary info ===============
 FAILED tests/test_x.py::test_one[a] - assert 1 == 2
