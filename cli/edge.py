@@ -86,23 +86,23 @@ def with_target(text: str, host: str, scope: str = "") -> str:
     if not (host or scope) or "doractl " not in text:
         return text
     verbs = "|".join(VERBS)
+    scopes = "--(?:system|user)"
     command = (
-        r"(\bby \S+ \(|\bon \S+: |\bsudo )?\bdoractl (?:(--system|--user) )?"
-        rf"((?:{verbs})\b(?: (?:--system|--user)\b)?)"
+        rf"(\bby \S+ \(|\bon \S+: |\bsudo )?\bdoractl (?:({scopes}) )?"
+        rf"({verbs})\b(?=( {scopes}\b)?)"
     )
 
     def there(found: re.Match[str]) -> str:
-        before, given, verb = found.groups("")
+        before, given, verb, behind = found.groups("")
         if before.startswith("by "):  # as in "stopped by root (doractl stop)": stays
             return found[0]
         # With sudo the scope is the system's; in "doractl list --system" it is behind the verb.
-        has_scope = before == "sudo " or " " in verb
+        has_scope = before == "sudo " or behind
         words = [given or ("" if has_scope else scope), verb]
-        if host and not before.startswith(
-            "on "
-        ):  # as in "on head: doractl stop": to be typed there
+        # As in "on head: doractl stop": to be typed there.
+        if host and not before.startswith("on "):
             # What env prints leads to 127.0.0.1 there, so -H refuses env.
-            words = [*words, "on", host] if verb.split()[0] == "env" else ["-H", host, *words]
+            words = [*words, "on", host] if verb == "env" else ["-H", host, *words]
         return " ".join([f"{before}doractl", *filter(None, words)])
 
     return re.sub(command, there, text)
