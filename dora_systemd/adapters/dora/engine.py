@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from dora_systemd.adapters.host.process_table import PROC, status_fields
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 
 if TYPE_CHECKING:
@@ -73,8 +74,7 @@ class Child(NamedTuple):
         """
         if self.popen.returncode is not None:
             return True
-        stat = Path(f"/proc/{self.popen.pid}/stat").read_bytes()
-        return bool(int(stat.rpartition(b")")[2].split()[_FLAGS]) & _PF_EXITING)
+        return bool(int(status_fields(PROC / str(self.popen.pid))[_FLAGS]) & _PF_EXITING)
 
     def send_signal(self, number: signal.Signals) -> None:
         """Send the child a signal, but never another process that has reused its pid."""

@@ -38,12 +38,12 @@ def session_members(session: int, proc: Path = PROC) -> list[int]:
 
 def _session(path: Path) -> int | None:
     try:
-        return int(_status_fields(path)[3])
+        return int(status_fields(path)[3])
     except (OSError, IndexError, ValueError):
         return None
 
 
-def _status_fields(path: Path) -> list[str]:
+def status_fields(path: Path) -> list[str]:
     """The fields of /proc/PID/stat after the name, which may contain blanks and parentheses."""
     return (path / "stat").read_text(errors="replace").rpartition(")")[2].split()
 
@@ -59,7 +59,7 @@ def _read_process(path: Path) -> "Process | None":
 
     try:
         command = beginning(path / "cmdline").decode(errors="replace").split("\0")[:-1]
-        parent = int(_status_fields(path)[1])
+        parent = int(status_fields(path)[1])
         group = group_in(beginning(path / "cgroup"))
     except (OSError, IndexError, ValueError):
         return None
