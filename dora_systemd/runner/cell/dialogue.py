@@ -6,7 +6,6 @@ becomes an event of the pump, and so does every exception.
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -114,10 +113,8 @@ class Dialogue(Tasks):
         """Return after ChildExited if a child is exiting: that explains a lost connection."""
         before = self._pump.cell.state
         await asyncio.sleep(_SETTLE_SECONDS)
-        with suppress(TimeoutError):
-            async with asyncio.timeout(_EXIT_SECONDS):
-                while self._engine.is_exiting() and self._pump.cell.state is before:
-                    await asyncio.sleep(_SETTLE_SECONDS)
+        if self._engine.is_exiting():
+            await self._pump.wait(lambda cell: cell.state is not before, _EXIT_SECONDS)
 
     def watch(self, child: engine.Child, on_line: Callable[[str], None] | None = None) -> None:
         """Read the output of a child process, and report its exit."""

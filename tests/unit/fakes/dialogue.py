@@ -26,6 +26,10 @@ class Heard(Pump):
         self.heard.append(event)
         self.calls.append(("push", type(event).__name__))
 
+    def enter(self, state: State) -> None:
+        self.cell = replace(self.cell, state=state)
+        self._tell_waiting()
+
     heard: list[life.Event]
     calls: Calls
 
@@ -52,7 +56,7 @@ class Bench:
         self.actions = self.dialogue.actions(DESCRIPTOR, {"ADDED": "1"})
 
     def enter(self, state: State) -> None:
-        self.pump.cell = replace(self.pump.cell, state=state)
+        self.pump.enter(state)
 
     async def do(self, do: Do) -> list[life.Event]:
         self.actions[do]()
