@@ -66,6 +66,10 @@ class Settings:
         """The source of the value of `setting`, for messages and `show`."""
         return self.sources[setting.name]
 
+    def is_in_file(self, setting: Setting[Any]) -> bool:
+        """Whether a settings file gives the value of `setting`: its source is an absolute path."""
+        return self.source(setting).startswith("/")
+
     def is_given(self, setting: Setting[Any]) -> bool:
         """Whether anything but the default gives a value for `setting`."""
         return self.sources[setting.name] != DEFAULT_SOURCE

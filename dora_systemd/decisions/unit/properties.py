@@ -101,9 +101,9 @@ def unit_properties(
     try:
         return with_assignments(properties, assignments, context.newer)
     except DoraSystemdError as error:
-        source = settings.source(PROPERTY)
-        code = ExitCode.BAD_INPUT if source.startswith("/") else error.code
-        raise DoraSystemdError(f"{error.message} ({source})", error.hint, code) from error
+        message = f"{error.message} ({settings.source(PROPERTY)})"
+        code = ExitCode.BAD_INPUT if settings.is_in_file(PROPERTY) else error.code
+        raise DoraSystemdError(message, error.hint, code) from error
 
 
 def format_unit(properties: Properties) -> str:

@@ -131,7 +131,7 @@ class Look(NamedTuple):
         try:
             found = find_dora(given, venv, search_path, self.sight)
         except DoraSystemdError:
-            if not self._is_named_in_file(DORA):
+            if not self.settings.is_in_file(DORA):
                 self._blame(DORA, find_dora(given, None, search_path), is_there=True)
             raise
         check_program(found, self.sight, self.user)
@@ -139,11 +139,8 @@ class Look(NamedTuple):
 
     def _blame(self, setting: Setting[Any], path: str, is_there: bool) -> None:
         """Raise DoraSystemdError for a path that root can see and the user cannot."""
-        if self.user is not None and is_there and not self._is_named_in_file(setting):
+        if self.user is not None and is_there and not self.settings.is_in_file(setting):
             raise cannot_reach(self.user.pw_name, path)
-
-    def _is_named_in_file(self, setting: Setting[Any]) -> bool:
-        return self.settings.source(setting).startswith("/")
 
 
 class Where(NamedTuple):
