@@ -66,7 +66,11 @@ def _check_unit(manager: Manager, plan: Needy, need: str, unit: str) -> None:
     if not need.startswith(DATAFLOW):
         raise _refusal(plan, need, f"unit {unit} is {state}", "see systemctl list-unit-files")
     name = need.removeprefix(DATAFLOW)
-    hint = "start it first; start --enable starts it at boot, too"
+    # Its needs are unknown: each of a circle that was never started is refused for the next one.
+    hint = (
+        f"start {name} first, with --enable to start it at boot, too; "
+        f"if {name} needs {plan.name}, they wait for each other: remove one of these needs"
+    )
     raise _refusal(plan, need, f"no dataflow named '{name}'", hint)
 
 

@@ -46,8 +46,16 @@ def test_a_dataflow_that_is_needed_has_to_be_started() -> None:
     """Nothing can be enabled that systemd has not loaded."""
     with pytest.raises(DoraSystemdError, match="no dataflow named 'base'") as caught:
         check_needs(FakeManager(), Needy("arm", False, ("dataflow:base",)))
-    assert caught.value.hint.startswith("start it first")
+    assert caught.value.hint.startswith("start base first")
     assert "doractl enable" not in caught.value.hint
+
+
+@pytest.mark.parametrize(("name", "other"), [("arm", "base"), ("base", "arm")])
+def test_two_that_need_each_other_are_named_before_one_was_started(name: str, other: str) -> None:
+    """Each start would else only say to start the other one first."""
+    with pytest.raises(DoraSystemdError) as caught:
+        check_needs(FakeManager(), Needy(name, False, (f"dataflow:{other}",)))
+    assert f"if {other} needs {name}, they wait for each other" in caught.value.hint
 
 
 def test_what_needs_a_dataflow_ends_with_it() -> None:
