@@ -28,7 +28,7 @@ from dora_systemd.decisions.releases.past import (
     kept,
     parse_history,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.names import STORE, TREE, is_release_id
 from dora_systemd.scope import place_hint
 from dora_systemd.trust.files import MAX_BYTES, append_lines, read_file, read_lines
@@ -87,9 +87,8 @@ class Store:
 
     def manifest(self, release_id: str) -> Manifest:
         """The manifest of a release. Raises DoraSystemdError (BAD_INPUT)."""
-        path = self.release(release_id) / MANIFEST
-        text = read_file(path, MOST_MANIFEST).data.decode("utf-8", "replace")
-        return parse_manifest(text, str(path))
+        text = self._text(release_id, MANIFEST, MOST_MANIFEST)
+        return parse_manifest(text, str(self.release(release_id) / MANIFEST))
 
     def intact(self, manifest: Manifest) -> dict[str, Stored]:
         """Return the files of a release that are unchanged since its manifest was written."""
@@ -104,8 +103,7 @@ class Store:
 
     def unit(self, release_id: str) -> str:
         """The unit file of a release. Raises DoraSystemdError (BAD_INPUT)."""
-        path = self.release(release_id) / UNIT
-        return read_file(path).data.decode("utf-8", "replace")
+        return self._text(release_id, UNIT, MAX_BYTES)
 
     def write_unit(self, release_id: str, text: str) -> None:
         """Write the unit file of a release. Raises OSError."""
@@ -157,6 +155,16 @@ class Store:
         if left := next(self.path.iterdir(), None):
             message = f"cannot remove {shown(str(left))}: something holds or creates files in it"
             raise DoraSystemdError(message, f"see: find {shown(str(left))}")
+
+    def _text(self, release_id: str, name: str, most: int) -> str:
+        """Read a file of a release that no caller has named, so no path can be corrected."""
+        try:
+            return read_file(self.release(release_id) / name, most).data.decode("utf-8", "replace")
+        except DoraSystemdError as error:
+            if isinstance(error.__cause__, PermissionError):
+                raise
+            hint = f"deploy again, or choose another release: doractl releases {self.name}"
+            raise bad_input(error.message, hint) from error
 
     def _names(self) -> list[str]:
         try:

@@ -155,6 +155,17 @@ def test_a_store_that_is_not_there(tmp_path: Path) -> None:
         store.manifest(ONE)
 
 
+@pytest.mark.parametrize("name", ["release.json", "unit"])
+def test_a_lost_file_of_a_release_says_what_to_do_instead(store: Store, name: str) -> None:
+    """Nobody has given its path, so there is no path to correct."""
+    written(store, ONE)
+    (store.release(ONE) / name).unlink(missing_ok=True)
+    with pytest.raises(DoraSystemdError, match=f"{ONE}/{name}: there is no such file") as caught:
+        (store.manifest if name == "release.json" else store.unit)(ONE)
+    hint = "deploy again, or choose another release: doractl releases robot"
+    assert caught.value.hint == hint
+
+
 @pytest.mark.parametrize(
     ("is_user", "state", "place"),
     [
