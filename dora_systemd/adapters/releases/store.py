@@ -24,6 +24,7 @@ from dora_systemd.decisions.releases.past import (
     MOST_LINES,
     Known,
     Switch,
+    count_damaged,
     format_switch,
     kept,
     parse_history,
@@ -128,6 +129,18 @@ class Store:
     def history(self) -> list[Switch]:
         """The changes of what ran, oldest first. Raises DoraSystemdError (BAD_INPUT)."""
         return parse_history(read_lines(self.path / HISTORY, MAX_BYTES))
+
+    def lost_changes(self) -> int:
+        """Count the damaged lines of the history, as far as this user may know.
+
+        Raises DoraSystemdError (BAD_INPUT).
+        """
+        try:
+            return count_damaged(read_lines(self.path / HISTORY, MAX_BYTES))
+        except DoraSystemdError as error:
+            if isinstance(error.__cause__, PermissionError):
+                return 0
+            raise
 
     def record(self, *switches: Switch) -> None:
         """Append changes of what runs to the history. Raises DoraSystemdError, OSError."""

@@ -55,8 +55,16 @@ def format_switch(one: Switch) -> bytes:
 
 def parse_history(data: bytes) -> list[Switch]:
     """Parse the changes in the file, oldest first. A partial or damaged line is left out."""
-    whole = data[: data.rfind(b"\n") + 1]
-    return [found for line in whole.splitlines() if (found := _parse(line))]
+    return [found for line in _whole_lines(data) if (found := _parse(line))]
+
+
+def count_damaged(data: bytes) -> int:
+    """Count the lines that parse_history() leaves out; the partial one of a power cut is none."""
+    return sum(_parse(line) is None for line in _whole_lines(data))
+
+
+def _whole_lines(data: bytes) -> list[bytes]:
+    return data.split(b"\n")[:-1]
 
 
 def completed(history: Sequence[Switch], current: str, at_us: int = 0) -> list[Switch]:

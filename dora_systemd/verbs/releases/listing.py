@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.releases.store import Store, is_locked, store_root
+from dora_systemd.adapters.releases.store import HISTORY, Store, is_locked, store_root
 from dora_systemd.adapters.releases.transfer import leftovers
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import (
@@ -24,6 +24,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import list_directory
+from dora_systemd.values import counted
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.releases.trial import (
     Standing,
@@ -122,6 +123,10 @@ def _judge(manager: Manager, scope: Scope, name: str) -> Iterator[Finding]:
     for path in () if is_locked(store) else remains(store, standing):
         text = f"{path} is the rest of a deploy that was killed"
         yield Finding("releases", State.NOTE, text, "the next deploy removes it")
+    if lost := store.lost_changes():
+        text = f"{store.path / HISTORY} has {counted(lost, 'damaged line')}: rollback ignores them"
+        remedy = f"check the disk; doractl releases {name} --history lists the others"
+        yield Finding("releases", State.WARNING, text, remedy)
 
 
 def refuse_on_trial(scope: Scope, cell: Cell, verb: str) -> None:

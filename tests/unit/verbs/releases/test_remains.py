@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.releases.store import Store
+from dora_systemd.decisions.releases.past import REPLACED, Switch
+from dora_systemd.decisions.views.findings import State
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import listing as module
@@ -77,3 +79,18 @@ def test_a_foreign_unit_hides_no_other_dataflow(
     told = [one.text for one in module.judge_releases(manager, scope)]
     assert any("is not doractl's" in one for one in told)
     assert any(".new-0a1b2c3d4e5f is the rest of" in one for one in told)
+
+
+def test_damaged_lines_of_the_history_are_reported(
+    manager: FakeManager, scope: Scope, store: Store
+) -> None:
+    """A rollback could take another release than the one that ran."""
+    deployed(manager)
+    store.record(Switch(1, OLD, NEW, REPLACED))
+    history = store.path / "history"
+    assert not [one for one in module.judge_releases(manager, scope) if " damaged line" in one.text]
+    history.write_bytes(history.read_bytes() + b'{"from": \r\0\nnothing\n{"power": "cu')
+    (found,) = [one for one in module.judge_releases(manager, scope) if " damaged line" in one.text]
+    assert found.text == f"{history} has 2 damaged lines: rollback ignores them"
+    assert found.state is State.WARNING
+    assert len(store.history()) == 1
