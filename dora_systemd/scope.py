@@ -58,6 +58,16 @@ class Scope(NamedTuple):
         """The option that selects this scope in systemctl, journalctl and doractl."""
         return f"--{self.word}"
 
+    @property
+    def command(self) -> str:
+        """The command that acts in this scope, with sudo for a user who may not use the system's.
+
+        Without an option where this scope is the default, see scope_of().
+        """
+        if self.is_user == bool(self.uid):
+            return "doractl"
+        return "doractl --user" if self.is_user else "sudo doractl"
+
 
 def scope_of(is_user: bool | None) -> Scope:
     """The requested scope; the default is the system's for root, else the user's."""

@@ -35,7 +35,7 @@ def require_gateway(manager: Manager, scope: Scope) -> int:
     """The port. Raises DoraSystemdError (NOT_RUNNING) if the gateway is not up."""
     gateway = read_gateway(manager)
     if not gateway.is_up or gateway.port is None:
-        hint = f"doractl {scope.flag} up"
+        hint = f"{scope.command} up"
         raise DoraSystemdError("cannot use the gateway: it is not up", hint, ExitCode.NOT_RUNNING)
     return gateway.port
 

@@ -53,7 +53,7 @@ def reached_coordinator(scope: Scope, manager: Manager, cell: Cell) -> Coordinat
     if is_private:
         raise usage_error(
             f"cannot reach the coordinator of {cell.name} by a port: its network is private",
-            f"doractl {scope.flag} dora {cell.name} -- ..., or doractl env for the gateway",
+            f"doractl {scope.flag} dora {cell.name} -- ..., or {scope.command} env for the gateway",
         )
     require_listener(coordinator.port, uid)
     return coordinator

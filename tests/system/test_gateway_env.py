@@ -27,7 +27,7 @@ def test_of_one_dataflow(cell: Cell, project: Project) -> None:
 def test_of_the_gateway(front: Front) -> None:
     refused = front.doractl("env", check=False)
     assert (refused.returncode, refused.stdout) == (ExitCode.NOT_RUNNING, "")
-    assert refused.stderr.endswith("hint: doractl --system up\n")
+    assert refused.stderr.endswith("hint: doractl up\n")
     front.up()
     curl = 'curl -s -H "Authorization: Bearer $DORA_AUTH_TOKEN" -o /dev/null -w "%{http_code}"'
     url = "http://$DORA_COORDINATOR_ADDR:$DORA_COORDINATOR_PORT/nothing"
@@ -38,6 +38,8 @@ def test_of_the_gateway(front: Front) -> None:
     refused = run(*_as("alice"), "doractl", "--system", "env", check=False)
     assert refused.returncode == ExitCode.NO_PERMISSION
     assert refused.stdout == ""
+    told = run(*_as("alice"), "doractl", "--system", "up").stdout
+    assert told.endswith("""Use 'eval "$(sudo doractl env)"' to connect the dora command to it\n""")
 
 
 def _as(user: str) -> tuple[str, ...]:

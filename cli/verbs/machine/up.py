@@ -9,12 +9,13 @@ from dora_systemd.cli.edge import Edge
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT, wanted_port
 from dora_systemd.decisions.views.outcome import Outcome, Thing
+from dora_systemd.scope import Scope
 from dora_systemd.verbs.gateway import check_answer, read_gateway
 from dora_systemd.verbs.up import check_machine, make_state, open_port, start_boot_target
 
 _USE = """
 
-Use 'eval "$(doractl env)"' to connect the dora command to it"""
+Use 'eval "$({} env)"' to connect the dora command to it"""
 _USE_THERE = """
 
 Use 'doractl dora NAME -- ARGUMENT...' to run the dora command there"""
@@ -45,7 +46,7 @@ def command(port: int | None) -> int:
     if now.is_up and wanted in (None, now.port):
         assert now.port is not None
         check_answer(scope, now.port)
-        return _print_port("Daemon already running", now.port)
+        return _print_port(scope, "Daemon already running", now.port)
     tell("Starting dora daemon...")
     check_machine(Bus, scope)
     make_state(scope)  # before a client can have systemd start the gateway
@@ -56,14 +57,14 @@ def command(port: int | None) -> int:
     tell("  ✓ Daemon ready")
     if names:
         tell(f"  ✓ Enabled dataflows started: {', '.join(names)}")
-    return _print_port("\nDaemon running", opened, names)
+    return _print_port(scope, "\nDaemon running", opened, names)
 
 
-def _print_port(text: str, port: int, started: list[str] | None = None) -> int:
+def _print_port(scope: Scope, text: str, port: int, started: list[str] | None = None) -> int:
     """started: the enabled dataflows that were started, None if the port was open before."""
     url = f"http://localhost:{port}"
     details = {"port": port, "url": url, "started": started or []}
     is_news = started is not None
-    use = _USE_THERE if Edge.reached_as else _USE
+    use = _USE_THERE if Edge.reached_as else _USE.format(scope.command)
     outcome = Outcome(Thing(SOCKET_UNIT), f"{text} at: {url}{use}", "", is_news, "", details)
     return print_outcomes([outcome])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.scope import place_hint, without_systemd
+from dora_systemd.scope import Scope, place_hint, without_systemd
 
 
 @pytest.mark.parametrize(
@@ -40,3 +40,16 @@ def test_places_that_cannot_be_written(
 ) -> None:
     monkeypatch.setenv("HOME", "/root")
     assert place_hint(Path(path), OSError(number, "no")).startswith(hint)
+
+
+@pytest.mark.parametrize(
+    ("is_user", "uid", "command"),
+    [
+        (False, 0, "doractl"),
+        (True, 1000, "doractl"),
+        (True, 0, "doractl --user"),
+        (False, 1000, "sudo doractl"),
+    ],
+)
+def test_a_recommended_command_works_for_the_user(is_user: bool, uid: int, command: str) -> None:
+    assert Scope(is_user, uid).command == command

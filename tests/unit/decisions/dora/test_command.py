@@ -96,7 +96,7 @@ def test_a_gateway_that_is_down(active: str, up: FakeManager, scope: ScopeIn) ->
     with pytest.raises(DoraSystemdError, match="cannot use the gateway: it is not up") as caught:
         read_variables(up, scope, None)
     assert caught.value.code is ExitCode.NOT_RUNNING
-    assert caught.value.hint == "doractl --system up"
+    assert caught.value.hint == "doractl up"
 
 
 @pytest.mark.parametrize(
