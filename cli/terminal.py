@@ -35,10 +35,14 @@ _BACK_AND_CLEAR = "\r\x1b[K"
 
 
 class StageLine(AbstractContextManager["StageLine"]):
-    """Shows the text of the last call, until the `with` block ends and erases it."""
+    """Shows the text of the last call, until the `with` block ends and erases it.
 
-    def __init__(self, stream: TextIO) -> None:
+    is_stop: what is waited for is an end, so that no machine is awaited.
+    """
+
+    def __init__(self, stream: TextIO, is_stop: bool = False) -> None:
         self._stream = stream
+        self._is_stop = is_stop
         self._is_terminal = stream.isatty()
         self._shown = ""
 
@@ -55,7 +59,7 @@ class StageLine(AbstractContextManager["StageLine"]):
 
     def _tell_machine(self, text: str) -> None:
         """Print which machine a start waits for, because the wait may be long."""
-        if not text.startswith("waiting for machine") or text == self._shown:
+        if self._is_stop or not text.startswith("waiting for machine") or text == self._shown:
             return
         # Imported late: most dataflows run on one machine.
         from dora_systemd.decisions.cell.machines import is_news

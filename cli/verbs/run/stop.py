@@ -153,7 +153,7 @@ def _stop(bus: Bus, scope: Scope, cells: list[Cell], most: int) -> int:
 
 
 def _wait(bus: Bus, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
-    with StageLine(sys.stderr) as stage:
+    with StageLine(sys.stderr, is_stop=True) as stage:
         return stop_cells(bus, scope, cells, partial(tell_stage, stage))
 
 

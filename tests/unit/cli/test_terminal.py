@@ -83,3 +83,11 @@ def test_a_pipe_hears_once_which_machine_is_away() -> None:
         stage(away)
         stage(away)
     assert stream.getvalue() == f"{away}\n"
+
+
+def test_a_stop_waits_for_no_machine() -> None:
+    """The first status of a dataflow that is stopped while it waits is that wait."""
+    stream = io.StringIO()
+    with StageLine(stream, is_stop=True) as stage:
+        stage("waiting for machine gpu (connection refused)")
+    assert not stream.getvalue()
