@@ -104,6 +104,7 @@ class NodeExited(Event):
     exit: Exit
     will_restart: bool  # dora is going to execute it again
     is_stale: bool = False  # a newer process of the node is already running
+    kept: int = 0  # the process that dora has kept, if it is not the one in the table
     oom: Oom | None = None  # the OOM kill, if the kernel killed it because of memory
     is_essential: bool = False  # the dataflow ends if the node fails finally
 

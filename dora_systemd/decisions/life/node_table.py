@@ -279,9 +279,9 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
     is_told = was_asked(old) or old.state == "reloading"
     if is_told and not event.is_stale and (is_stopped(old) or not is_stopping):
         return _exited_as_told(nodes, event, old)
-    if old.state == "waiting" and not is_stopping:
+    if event.kept or (old.state == "waiting" and not is_stopping):
         # The process before this wait, or a launcher that was replaced: neither is a crash.
-        pid = old.pid if event.is_stale else 0
+        pid = event.kept or (old.pid if event.is_stale else 0)
         return {**nodes, event.node: old._replace(pid=pid)}, None
     if _is_of_another(old, event):
         return nodes, None

@@ -67,6 +67,7 @@ class Dialogue(Tasks):
         self.hold: Hold = no_hold
         self._loop = asyncio.get_running_loop()
         self._exits: dict[str, tuple[life.NodeExited, asyncio.TimerHandle]] = {}
+        self._earlier: dict[str, int] = {}  # pid of each node before its last NodeSpawned
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -202,6 +203,7 @@ class Dialogue(Tasks):
             return
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
+            self._earlier[event.node] = self._pump.cell.nodes.get(event.node, NodeStatus()).pid
             self._nodes.adopt(event.node, event.pid, rights_of(self._options))
         if isinstance(event, life.NodeExited):
             self._pipes.read_output("daemon")  # it has printed before why it killed the node
@@ -246,6 +248,10 @@ class Dialogue(Tasks):
             # Dora has cancelled the restart of that process, if there was to be one.
             self._pump.push(replace(event, is_stale=True, will_restart=False))
             return
+        if stale and (kept := self._kept(event.node)):
+            self._nodes.adopt(event.node, kept, rights_of(self._options))
+            self._pump.push(replace(event, is_stale=True, will_restart=False, kept=kept))
+            return
         is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
         essential = event.node in essential_nodes(self._options)
         oom = self._nodes.find_oom(event.node)
@@ -255,6 +261,15 @@ class Dialogue(Tasks):
         self._pump.push(event)
         if not is_stale:
             self._nodes.forget(event.node)
+
+    def _kept(self, node: str) -> int:
+        """Return the pid of the process that dora has kept if it ended the newer one, or 0.
+
+        A restart after the restart delay and a ReplaceNode at the same time start one process each.
+        dora keeps that of ReplaceNode, which it may have started first.
+        """
+        earlier = self._earlier.get(node, 0)
+        return earlier if earlier and self._nodes.has_process(node, earlier) else 0
 
     def _clear(self, event: life.NodeExited, node: NodeStatus) -> None:
         """Kill the leftovers that a next process would meet, or that a watchdog was to end."""

@@ -180,6 +180,27 @@ def test_the_cause_is_that_of_the_process_that_failed(
     live(work)
 
 
+@pytest.mark.parametrize("state", ["waiting", "reloading", "running"])
+def test_dora_ends_the_newer_process_and_keeps_the_earlier_one(tmp_path: Path, state: str) -> None:
+    """ReplaceNode and a restart after its delay, on a slow machine: each starts a process."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path, kind=Taking)
+        bench.pump.cell = replace(bench.pump.cell, nodes={"a": NodeStatus(state, 0, 1)})
+        bench.nodes.living = {("a", 8)}
+        spawned = "spawned node with pid {}"
+        ready = [] if state == "waiting" else ["node is ready"]
+        await hear(bench, spawned.format(8), spawned.format(9), *ready)
+        before = bench.pump.cell.nodes["a"]
+        await hear(bench, KILLED, REPLACED.format(9))
+        await asyncio.sleep(2)
+        assert before.pid == 9
+        assert bench.pump.cell.nodes["a"] == before._replace(pid=8)
+        assert not [name for name, *_ in bench.pipes.events if name == "node-crashed"]
+
+    live(work)
+
+
 def test_the_end_of_a_node_that_is_removed(tmp_path: Path) -> None:
     """Dora reports it like that of a replaced one, but no other process follows."""
 
