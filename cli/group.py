@@ -1,5 +1,6 @@
 """The verbs of doractl as a click group that imports only the verb that runs."""
 
+import re
 from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
@@ -19,6 +20,7 @@ TITLES = {
     "change": "Change what runs",
     "machine": "This machine",
 }
+_HEADING = "Examples:"
 SECTIONS = tuple(TITLES)
 """The directories of verbs/, in the order of --help."""
 
@@ -35,8 +37,9 @@ class Verb(NamedTuple):
         name = f"dora_systemd.cli.verbs.{self.section}.{self.name}"
         found: click.Command = import_module(name).command
         _put_examples_last(found)
+        found.context_class = _Context
         for member in getattr(found, "commands", {}).values():
-            member.epilog = found.epilog
+            member.epilog, member.context_class = found.epilog, _Context
         return found
 
     @property
@@ -48,9 +51,38 @@ class Verb(NamedTuple):
 
 def _put_examples_last(command: click.Command) -> None:
     """Let --help print the examples, with which the docstring ends, below the options."""
-    text, mark, examples = cleandoc(command.help or "").partition("\n\nExamples:")
+    text, mark, examples = cleandoc(command.help or "").partition(f"\n\n{_HEADING}")
     if mark:
-        command.help, command.epilog = text, f"\b\nExamples:{examples}"
+        command.help, command.epilog = text, f"\b\n{_HEADING}{examples}"
+
+
+class _Formatter(click.HelpFormatter):
+    """Breaks examples that are wider than the terminal, whose lines click leaves as they are."""
+
+    def write_text(self, text: str) -> None:
+        if text.startswith(f"\b\n{_HEADING}"):
+            columns = self.width + 2 - self.current_indent  # click leaves two columns empty
+            lines = (_fitted_example(line, columns) for line in text.splitlines())
+            text = "\n".join(lines)
+        super().write_text(text)
+
+
+class _Context(click.Context):
+    formatter_class = _Formatter
+
+
+def _fitted_example(line: str, columns: int) -> str:
+    """Break before options, as a shell reads it; what follows two blanks explains the example."""
+    if len(line) <= columns:
+        return line
+    command, _, text = line.strip().partition("  ")
+    lines = [" "]
+    for part in re.split(r" (?=[->])", command):
+        if lines[-1].strip() and len(f"{lines[-1]} {part} \\") > columns:
+            lines[-1] += " \\"
+            lines.append("     ")
+        lines[-1] += f" {part}"
+    return "\n".join([*lines, *([f"      {text.strip()}"] if text else [])])
 
 
 def find_verbs() -> dict[str, Verb]:

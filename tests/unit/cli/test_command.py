@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -25,6 +26,7 @@ from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import scope_of
 from tests.unit.checkout import module_paths
+from tests.unit.project.test_manpages import all_verbs
 
 SHORT_LIVED = ("pydantic", "websockets", "watchfiles", "lxml", "rich")
 """What verbs that are called again and again must not load."""
@@ -79,6 +81,20 @@ def test_every_verb_has_help_with_examples(
     assert f"doractl {ALIASES.get(name, name)}" in shown
 
 
+@pytest.mark.parametrize("verb", sorted(all_verbs()))
+def test_examples_fit_a_narrow_terminal(
+    verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are broken as a shell reads them."""
+    shown = {}
+    for columns in ("60", "100"):
+        monkeypatch.setenv("COLUMNS", columns)
+        assert main.run([*verb.split(), "--help=all"]) == 0
+        shown[columns] = capsys.readouterr().out.partition("\nExamples:\n")[2]
+    assert [line for line in shown["60"].splitlines() if len(line) > 60] == []
+    assert re.sub(r"( \\)?\s+", " ", shown["60"]) == re.sub(r"\s+", " ", shown["100"])
+
+
 @pytest.mark.parametrize("verb", ["start", "run", "deploy"])
 def test_the_usual_options_are_one_screen(
     verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -87,6 +103,7 @@ def test_the_usual_options_are_one_screen(
     assert main.run([verb, "--help"]) == 0
     short = capsys.readouterr().out.splitlines()
     assert len(short) <= 30
+    monkeypatch.setenv("COLUMNS", "100")  # examples are whole
     for words in ([verb, "--help=all"], ["help", verb, "--help=all"], [verb, "x", "--help=all"]):
         assert main.run(words) == 0
         full = capsys.readouterr().out
