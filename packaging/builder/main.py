@@ -26,7 +26,10 @@ VARIATIONS = (
 UMASKS = ("0022", "0002")
 # Beside this: what makes no packages.
 NO_PACKAGES = ("wheels.py", "autopkgtest.py", "autopkgtest.sh")
-LINTIAN = ("lintian", "--allow-root", "--fail-on=error,warning", "--tag-display-limit=0")
+# It looks for modules that Python 3.13 has removed, line by line, which takes nine tenths of its
+# time. The unit tests import all modules there.
+IMPORTED = "--dont-check-part=languages/python/stdlib-deprecation"
+LINTIAN = ("lintian", "--allow-root", "--fail-on=error,warning", "--tag-display-limit=0", IMPORTED)
 
 
 def main(arguments: Sequence[str]) -> int:
