@@ -7,11 +7,12 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from typing import NoReturn
 
 from dora_systemd import __version__
 from dora_systemd.cli.edge import asks_for_json, print_error, put_in_place
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 
 LIST_VERBS = ("list", "ps", "status")
 GARBAGE_OBJECTS = 50_000
@@ -73,8 +74,18 @@ def _failed(error: OSError) -> DoraSystemdError:
     what = "write output" if error.errno in _OUTPUT_ERRORS else "continue"
     # A file may be known by its descriptor, and an error without a number has its own words.
     file = error.filename if isinstance(error.filename, str) else ""
+    if error.errno == errno.ENOENT and not file and not _has_directory():
+        hint = "cd to a directory that exists"
+        return bad_input("cannot continue: the current directory was removed", hint)
     reason = error.strerror or str(error) or type(error).__name__
     return DoraSystemdError(f"cannot {what}: {reason}", file)
+
+
+def _has_directory() -> bool:
+    """Whether the current directory exists."""
+    with suppress(OSError):
+        return bool(Path.cwd())
+    return False
 
 
 def _mistake_of_ours(error: Exception) -> DoraSystemdError:

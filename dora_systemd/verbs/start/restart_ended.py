@@ -64,7 +64,10 @@ def means_name(text: str) -> bool:
     """Whether the text is not that of a file: it can be a name, a unit or a UUID."""
     if "/" in text or text.endswith((".yml", ".yaml", ".json")):
         return False
-    path = Path(text).absolute()
+    try:
+        path = Path(text).absolute()
+    except FileNotFoundError:
+        return True  # the current directory was removed, and has no files
     return is_directory(path) or not exists(path)
 
 

@@ -382,6 +382,18 @@ def test_any_error_of_the_system_is_one_line(
     assert (given_up[1:] == [sys.stdout.fileno()]) is ("write output" in said)
 
 
+def test_a_current_directory_that_was_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main.run(["why", "--bundle", "robot.tar"]) == ExitCode.BAD_INPUT
+    said = "doractl: cannot continue: the current directory was removed\nhint: cd to a directory"
+    assert capfd.readouterr().err.startswith(said)
+
+
 def test_a_reader_that_went_away_is_no_error() -> None:
     read, write = os.pipe()
     os.close(read)

@@ -33,7 +33,7 @@ from dora_systemd.verbs.start.read import (
     read_settings_file,
 )
 from dora_systemd.verbs.start.request import StartRequest, current_directory, request_name
-from dora_systemd.verbs.start.restart_ended import Asked
+from dora_systemd.verbs.start.restart_ended import Asked, means_name
 from dora_systemd.verbs.start.settings import check_config, require_modest, settings_of
 from dora_systemd.verbs.start.where import account_of, choose_user
 from tests.unit.fakes.programs import make_dora, make_program
@@ -96,6 +96,7 @@ def test_no_directory_here(project: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert one.value.code is ExitCode.BAD_INPUT
     assert plan_of(project).options.name == "robot"
     assert current_directory() == Path("/")
+    assert means_name("robot")
 
 
 def test_every_plan_has_a_uuid_of_its_own(project: Path) -> None:
