@@ -3,9 +3,11 @@
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -269,6 +271,20 @@ def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
     return next(filter(None, names), "less"), environment
 
 
+@contextmanager
+def interrupts_for_pager() -> Iterator[None]:
+    """In the context, Ctrl+C does not end doractl: the pager decides what happens.
+
+    less(1) without its option K stays, and must not lose the terminal to the caller's shell.
+    """
+    # Not SIG_IGN, which the pager would inherit.
+    before = signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def print_paged(chunks: Iterator[bytes]) -> None:
     """Print to the pager that journalctl(1) would use, with the same options."""
     pager, environment = pager_of(os.environ)
@@ -276,7 +292,10 @@ def print_paged(chunks: Iterator[bytes]) -> None:
         _write(chunks, sys.stdout.fileno())
         return
     check_program(pager.split()[0])
-    with subprocess.Popen(pager, shell=True, stdin=subprocess.PIPE, env=environment) as child:
+    with (
+        interrupts_for_pager(),
+        subprocess.Popen(pager, shell=True, stdin=subprocess.PIPE, env=environment) as child,
+    ):
         assert child.stdin
         try:
             _write(chunks, child.stdin.fileno())
