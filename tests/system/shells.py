@@ -13,7 +13,7 @@ _BASH = """
 . /usr/share/bash-completion/bash_completion
 _comp_load doractl 2>/dev/null || _completion_loader doractl || :
 COMP_LINE=$1 COMP_POINT=${#1}
-read -ra COMP_WORDS <<<"$1"
+read -ra COMP_WORDS <<<"${1//=/ = }"
 case $1 in *" ") COMP_WORDS+=("") ;; esac
 COMP_CWORD=$((${#COMP_WORDS[@]} - 1))
 _doractl

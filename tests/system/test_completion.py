@@ -35,6 +35,10 @@ class TestWhatRuns:
         assert ask(nodes, ()) == ["doubler"], f"bash: {SHELLS['bash'](nodes, ())}"
         assert running.name not in ask(f"doractl stop {running.name} {begun}", ()), "given already"
         assert ask("doractl sto", ()) == ["stop"]
+        (level,) = ask("doractl logs --level=w", ())
+        assert level.removeprefix("--level=") == "warn"
+        if shell != "bash":
+            assert level != "warn", "it would replace the option"
 
     def test_what_has_stopped(self, running: Cell) -> None:
         """The last one: no shell offers it again."""

@@ -1,8 +1,10 @@
 """What the shells are told at the Tab key, as far as no systemd is needed for it."""
 
 import os
+import re
+import shlex
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import click
@@ -141,22 +143,61 @@ def test_scripts_are_readable_for_their_shells(shell: str) -> None:
 
 BASH = """
 source {script}
-COMP_WORDS=(doractl stop {word}); COMP_CWORD=2
+compopt() {{ COMPREPLY+=("$*"); }}
+COMP_LINE={line}; COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
 _doractl
 printf '%s\\n' "${{COMPREPLY[@]}}"
 """
 
 
-def test_bash_takes_the_answer(tmp_path: Path) -> None:
-    """A value is one word, whatever characters are in it."""
-    answer = 'echo "plain,$COMP_WORDS|$COMP_CWORD"\necho "plain,a b"'
-    make_program(tmp_path / "doractl", answer)
-    script = BASH.format(script=CHECKOUT / "packaging/completions/doractl", word="ro")
+def ask_bash(place: Path, line: str, words: Sequence[str], answer: str) -> list[str]:
+    """What the script offers. words: as bash gives them. answer: prints that of doractl."""
+    make_program(place / "doractl", answer)
+    given = {"line": shlex.quote(line), "words": shlex.join(words)}
+    script = BASH.format(script=CHECKOUT / "packaging/completions/doractl", **given)
     done = subprocess.run(
         ["bash", "-c", script],
-        env={"PATH": f"{tmp_path}:/usr/bin:/bin"},
+        env={"PATH": f"{place}:/usr/bin:/bin"},
         capture_output=True,
         text=True,
         check=True,
     )
-    assert done.stdout == "doractl stop ro|2\na b\n"
+    return done.stdout.splitlines()
+
+
+def test_bash_takes_the_answer(tmp_path: Path) -> None:
+    """A value is one word, whatever characters are in it."""
+    answer = 'echo "plain,$COMP_WORDS|$COMP_CWORD"\necho "plain,a b"'
+    words = ["doractl", "stop", "ro"]
+    offered = ask_bash(tmp_path, "doractl  stop ro", words, answer)
+    assert offered == ["doractl stop ro|2", "a b"]
+
+
+@pytest.mark.parametrize(
+    ("line", "value", "offered"),
+    [
+        ("doractl logs --level = w", "warn", "warn"),
+        ("doractl logs --level =", "warn", "warn"),
+        ("doractl -H box : 22", "box:2222", "2222"),
+        ("doractl -H box :", "box:2222", "2222"),
+        ("doractl -H alice @ ar", "alice@arm", "@arm"),
+        ("doractl -H alice @", "alice@arm", "@arm"),
+        ("doractl --host = base,alice @ ar", "base,alice@arm", "@arm"),
+        ("doractl -H 'alice@ar", "alice@arm", "alice@arm"),
+    ],
+)
+def test_bash_cuts_words(tmp_path: Path, line: str, value: str, offered: str) -> None:
+    """At = : and @; what bash replaces begins behind = and :, and with @."""
+    whole = re.sub(" ([=:@]) ?", r"\1", line)
+    answer = f'echo "plain,{value}"; echo "plain,$COMP_WORDS|$COMP_CWORD"'
+    last = f"{whole}|{whole.count(' ')}"
+    assert ask_bash(tmp_path, whole, line.split(), answer) == [offered, last]
+
+
+@pytest.mark.parametrize("line", ["doractl list > fi", "doractl list 2> fi", "doractl list <"])
+def test_bash_completes_a_file_behind_a_redirection(tmp_path: Path, line: str) -> None:
+    words = line.replace("2>", "2 >").split()
+    words += [""] * line.endswith("<")
+    assert ask_bash(tmp_path, line, words, "echo plain,robot") == ["-o default"]
+    quoted = ["doractl", "logs", "--grep", "'<x>'", "ro"]
+    assert ask_bash(tmp_path, " ".join(quoted), quoted, "echo plain,robot") == ["robot"]
