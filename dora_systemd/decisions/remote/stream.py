@@ -6,6 +6,8 @@ from typing import Any
 _NOISE = 4096
 MAX_LINE = 1 << 20
 """A line that is longer is taken as several: no host can fill our memory."""
+_MOST_LEVELS = 100
+"""Far more than an answer of doractl has, and less than json can write anywhere."""
 
 
 class AfterMark:
@@ -54,7 +56,7 @@ def read_json(text: str) -> Any:
 
 
 def read_object(text: str) -> dict[str, Any] | None:
-    """Parse the object in a text; None for other text, and for one that json cannot write."""
+    """Parse the object in a text; None for other text, and for one of too many levels."""
     value = read_json(text)
     return value if isinstance(value, dict) and _is_printable(value) else None
 
@@ -67,7 +69,7 @@ def with_host(value: dict[str, Any], host: str, key: str = "host") -> dict[str, 
 
 
 def objects_of(text: str, host: str) -> list[dict[str, Any]] | None:
-    """Parse an object, or a list of objects, and add the host to each; None for other text."""
+    """Parse an object, or a list of objects, and add the host to each; None as in read_object()."""
     value = read_json(text)
     if not _is_printable(value):
         return None
@@ -77,10 +79,9 @@ def objects_of(text: str, host: str) -> list[dict[str, Any]] | None:
     return [with_host(one, host) for one in found]
 
 
-def _is_printable(value: object) -> bool:
-    """Whether json can write what it has read: it reads deeper lists than it writes."""
-    try:
-        json.dumps(value, indent=0)
-    except RecursionError:
-        return False
-    return True
+def _is_printable(value: object, levels: int = _MOST_LEVELS) -> bool:
+    """Whether json can write what it has read: Python reads deeper lists than it writes."""
+    if not isinstance(value, dict | list):
+        return True
+    parts = value.values() if isinstance(value, dict) else value
+    return levels > 0 and all(_is_printable(one, levels - 1) for one in parts)
