@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_oom
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
+from dora_systemd.decisions.life.causes import RUNNER_KILLED, UNIT_RESULTS, Cause
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.decisions.resources.oom import Owner, largest, owner_details
 from dora_systemd.errors import DoraSystemdError
@@ -71,7 +71,7 @@ def killed_by(environ: Mapping[str, str]) -> tuple[Cause, str]:
     result = environ.get("SERVICE_RESULT", "")
     if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
         return Cause.RUNNER_KILLED, ""
-    killed = f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
+    killed = f"{RUNNER_KILLED} (SIG{environ.get('EXIT_STATUS', '')})"
     return UNIT_RESULTS.get(result, (Cause.RUNNER_KILLED, killed))
 
 
@@ -162,7 +162,7 @@ def out_of_memory(unit: Path) -> dict[str, str]:
     node, held = largest({key: cgroup.read_usage(one).memory or 0 for key, one in groups.items()})
     most = f"; the node {node} held most, {format_rounded_size(held)}" if node else ""
     details = {
-        "reason": f"the supervisor process was killed, out of memory{most}",
+        "reason": f"{RUNNER_KILLED}, out of memory{most}",
         "cause": str(Cause.OUT_OF_MEMORY),
     }
     if not read_oom(unit).refusals:

@@ -8,6 +8,9 @@ ESSENTIAL = "essential "
 
 NO_END = "its end is not recorded: it was killed, or the machine went down"
 """The text for an end without any record of its cause."""
+RUNNER_KILLED = "the supervisor process was killed"
+BY_SIGKILL = f"{RUNNER_KILLED} (SIGKILL)"
+"""The text for a runner that was killed: by `stop --now`, another person, or a program."""
 
 
 class Cause(StrEnum):

@@ -10,7 +10,15 @@ from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_e
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.owes import STARVED
 from dora_systemd.decisions.cell.status import RESTART
-from dora_systemd.decisions.life.causes import ESSENTIAL, NO_END, UNIT_RESULTS, Cause, result_words
+from dora_systemd.decisions.life.causes import (
+    BY_SIGKILL,
+    ESSENTIAL,
+    NO_END,
+    RUNNER_KILLED,
+    UNIT_RESULTS,
+    Cause,
+    result_words,
+)
 from dora_systemd.decisions.life.refusal import setup_failure
 from dora_systemd.decisions.logs.journal_events import NODE_END_EVENTS, NODE_FAILURES
 from dora_systemd.decisions.reload.changes import How
@@ -24,7 +32,6 @@ _LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST, Cause.MACHINE_LOST)
 """Causes with the same names as their events."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
-_KILLED = "the supervisor process was killed"
 _OOM_SPAN = 10 * SECOND
 """Maximum µs between systemd's records of an OOM kill and of the end of the killed process."""
 UNKNOWN_PERSON = "a request to systemd (by whom is not recorded)"
@@ -168,6 +175,9 @@ def _crash(crash: Happening) -> Verdict:
 
 def _end(life: Life, facts: Facts, shutdowns: Sequence[int]) -> Verdict:
     if (failure := life.last("dataflow-failed")) is not None:
+        if failure.detail("reason") == BY_SIGKILL and life.last("stop-asked") is not None:
+            by = stopped_by(life, shutdowns)  # with --now
+            return _found(Cause.STOPPED, f"stopped by {by}; killed", failure, by=by)
         return _failure(life, failure)
     if (end := life.last("unit-failed")) is not None:
         return _unit_failure(life, end)
@@ -248,7 +258,7 @@ def _unit_failure(life: Life, end: Happening) -> Verdict:
         return _found(cause, words, end)
     exit = life.last("process-exited")
     if exit is not None and _is_oom(exit, life):
-        return _found(Cause.OUT_OF_MEMORY, f"{_KILLED}, out of memory", end)
+        return _found(Cause.OUT_OF_MEMORY, f"{RUNNER_KILLED}, out of memory", end)
     how = result_words(result) or (_exit_words(exit) if exit else "")
     said = how or f"the unit failed: {result or 'systemd does not say how'}"
     return _found(Cause.UNIT_FAILED, said, end)
@@ -263,7 +273,8 @@ def _is_oom(exit: Happening, life: Life) -> bool:
 def _exit_words(exit: Happening) -> str:
     status = exit.detail("exit_status") or "unknown"
     if exit.detail("exit_code") != "exited":
-        return f"{_KILLED} ({exit_of(-int(status)) if status.isdecimal() else f'signal {status}'})"
+        how = exit_of(-int(status)) if status.isdecimal() else f"signal {status}"
+        return f"{RUNNER_KILLED} ({how})"
     refused = setup_failure(int(status)) if status.isdecimal() else ""
     return refused or f"the supervisor process failed (exit code {status})"
 

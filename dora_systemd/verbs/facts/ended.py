@@ -12,7 +12,7 @@ from dora_systemd.adapters.journal.reader import (
     is_volatile,
     later_failures,
 )
-from dora_systemd.decisions.life.causes import NO_END
+from dora_systemd.decisions.life.causes import BY_SIGKILL, NO_END
 from dora_systemd.decisions.logs.journal_events import CLEAN_ENDS, FORGOTTEN
 from dora_systemd.decisions.logs.query import request_matches
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, is_up_word
@@ -59,10 +59,11 @@ def newest_ended(
 
 
 def with_cause(scope: Scope, row: DataflowRow) -> DataflowRow:
-    """Return the row, with the verdict of `why` if no event of ours has recorded the end."""
-    if row.text != NO_END:
+    """Return the row, with the verdict of `why` if no event of ours has recorded the whole end."""
+    if row.text not in (NO_END, BY_SIGKILL):
         return row
-    # Imported late: the end is recorded unless the machine went down, or nothing of ours ran.
+    # Imported late: the end is recorded unless the machine went down, or nothing of ours ran; and
+    # few end by SIGKILL, which `stop --now` sends.
     from dora_systemd.decisions.why.postmortem import examine
     from dora_systemd.decisions.why.verdict import Facts
     from dora_systemd.verbs.facts.lives import now_boot, read_lives

@@ -203,6 +203,16 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, *STOPPED),
         *("Stopped", Cause.STOPPED, "", "stopped by root (doractl stop)"),
     ),
+    "stopped at once": (
+        (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, STOPPED[0],
+         failed("runner-killed", "the supervisor process was killed (SIGKILL)")),
+        *("Stopped", Cause.STOPPED, "", "stopped by root (doractl stop); killed"),
+    ),
+    "crashed during a stop": (
+        (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, STOPPED[0],
+         failed("runner-killed", "the supervisor process was killed (SIGSEGV)")),
+        *("Failed", Cause.RUNNER_KILLED, "", "the supervisor process was killed (SIGSEGV)"),
+    ),
     "stopped, and a node had to be killed": (
         (*RUNS, event("node-exited", "camera", exit="signal SIGKILL"), JOB, STOPPED[0],
          event("node-exited", "plot"), event("node-exited", "deaf", exit="signal SIGKILL"),

@@ -1,10 +1,13 @@
 """Dataflows that only the journal knows."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dora_systemd.adapters.journal.reader import LastEvent
+from dora_systemd.decisions.life.causes import BY_SIGKILL
+from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -102,6 +105,20 @@ def test_a_stop_that_calls_a_restart_off_leaves_it_failed(
     journal.write(life_record("dataflow-failed", 35, "still", DORA_REASON="node a: exit code 1"))
     (row,) = (row for row in ended(manager) if row.name == "still")
     assert (row.status, row.text, row.ended) == shown
+
+
+def test_a_stop_that_killed_is_no_failure(manager: FakeManager, journal: FakeJournal) -> None:
+    def record(event: str, at_us: int, invocation: str, **fields: Any) -> dict[str, object]:
+        fields |= {"MESSAGE_ID": EVENTS[event].message_id, "_SYSTEMD_INVOCATION_ID": invocation}
+        return life_record(event, at_us, "gone", **fields)
+
+    journal.write(
+        record("dataflow-failed", 32, "1", DORA_REASON=BY_SIGKILL, DORA_CAUSE="runner-killed"),
+        record("stop-asked", 31, "session", DORA_BY="root (doractl stop)"),
+        record("dataflow-started", 30, "1"),
+    )
+    (row,) = (row for row in ended(manager) if row.name == "gone")
+    assert (row.status, row.text) == ("Stopped", "stopped by root (doractl stop); killed")
 
 
 @pytest.mark.parametrize(
