@@ -13,6 +13,8 @@ _OF_SSH = (
 )
 _MOST = 200
 _HINT = "hint: "
+_CLOSED = "try: ssh {text} true; after failed logins sshd may refuse this machine for a while"
+"""PerSourcePenalties of sshd_config(5): ssh itself reports that only with a lower LogLevel."""
 _HINTS = (
     ("HAS CHANGED", "if the host was installed again: ssh-keygen -R {name}, then ssh {text}"),
     ("Host key verification failed", "log in once to see and accept its key: ssh {text}"),
@@ -21,13 +23,15 @@ _HINTS = (
     ("Connection refused", "start sshd there, or give its port: {name}:PORT"),
     ("timed out", "check that the host is on, and that the network leads to it"),
     ("No route to host", "check that the host is on, and that the network leads to it"),
+    ("Connection reset", _CLOSED),
 )
 _INSTALL = "install dora-systemd there, or link it into /usr/local/bin: ssh has a PATH of its own"
 
 
 def unreached(host: Host, words: str) -> DoraSystemdError:
     """Return the error of a host that ssh cannot reach. words: messages of ssh and the host."""
-    hint = next((hint for part, hint in _HINTS if part in words), "try: ssh {text} true")
+    other = "try: ssh {text} true" if words else _CLOSED
+    hint = next((hint for part, hint in _HINTS if part in words), other)
     name = host.destination.rpartition("@")[2]
     hint = hint.format(text=_by_ssh(host), name=name)
     reason = "the host key has changed" if "HAS CHANGED" in words else last_line(words)

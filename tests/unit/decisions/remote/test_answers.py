@@ -108,6 +108,15 @@ def test_a_hint_is_a_command_of_ssh() -> None:
     assert unreached(parse_host("a:2222"), "odd").hint == "try: ssh -p 2222 a true"
 
 
+@pytest.mark.parametrize(
+    "said", ["", "kex_exchange_identification: read: Connection reset by peer"]
+)
+def test_a_host_that_closes_the_connection_at_once(said: str) -> None:
+    """So does sshd for some time after failed logins; ssh may say nothing about it."""
+    hint = "try: ssh a true; after failed logins sshd may refuse this machine for a while"
+    assert unreached(parse_host("a"), said).hint == hint
+
+
 def test_what_ssh_says_is_not_repeated() -> None:
     assert is_of_ssh(b"Connection to 10.0.0.1 closed by remote host.\r\n")
     assert is_of_ssh(b"client_loop: send disconnect: Broken pipe\r\n")
