@@ -49,7 +49,8 @@ def _agrees(kept: Kept) -> bool:
         raise usage_error(
             f"cannot forget {kept.name}: the question needs a terminal", "use --force"
         )
-    return click.confirm(f"Remove {_count(kept)} of {kept.name} for good?", err=True)
+    what = f"{kept.name} and its {_count(kept)}" if kept.releases else kept.name
+    return click.confirm(f"Forget {what} for good?", err=True)
 
 
 def _count(kept: Kept) -> str:
