@@ -4,8 +4,10 @@ import json
 import os
 import re
 import signal
+import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -67,6 +69,39 @@ def test_stop_all(cell: Cell, project: Project) -> None:
     assert done.stdout.count("Dataflow stopped: ") == 1
     assert all(one.is_gone for one in (cell, *others))
     assert cell.doractl("stop", "--all").stdout == "No dataflow is running.\n"
+
+
+@pytest.mark.lab
+@pytest.mark.warns("was killed (SIGKILL)", "status=9/KILL", "Failed with result")
+def test_an_interrupted_stop_continues(cell: Cell, project: Project) -> None:
+    project.write("deaf.py", DEAF)
+    tick = "inputs: {tick: dora/timer/millis/50}"
+    cell.start(project.write("dataflow.yml", f"nodes: [{{id: one, path: deaf.py, {tick}}}]"))
+    wait_for("it is deaf", lambda: "deaf" in cell.messages("one"))
+    command = ["doractl", cell.scope.flag, "stop", cell.name]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as first:
+        wait_for("it stops", lambda: cell.show("ActiveState") == "deactivating")
+        first.send_signal(signal.SIGINT)
+        assert first.stderr is not None
+        said = first.stderr.readline()
+    assert said == f"doractl: interrupted; the stop of {cell.name} continues\n"
+    assert first.returncode == ExitCode.INTERRUPTED
+    done = cell.doractl("start", cell.name, check=False)
+    assert done.returncode == ExitCode.NAME_IN_USE
+    assert done.stderr.startswith(f"doractl: cannot start {cell.name}: it is stopping\n")
+    assert cell.doractl("stop", "--now", cell.name).stdout.endswith(": killed\n")
+    # It ended as it was told to, so this is no failure.
+    who = r"stopped by \S+ [(]doractl stop[)]; killed"
+    why = cell.doractl("why", cell.name).stdout
+    assert re.search(rf"Stopped\n +Why: +{who}\n", why), why
+    row = next(one for one in _rows(cell) if one["name"] == cell.name)
+    assert (row["status"], bool(re.fullmatch(who, row["text"]))) == ("Stopped", True), row
+
+
+def _rows(cell: Cell) -> list[dict[str, Any]]:
+    sync_journal()
+    rows: list[dict[str, Any]] = json.loads(cell.doractl("list", "--all", "-o", "json").stdout)
+    return rows
 
 
 @pytest.mark.warns("not stopping within the 1.5s", "process was killed on drop", "Signal(9)")

@@ -179,8 +179,14 @@ def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
 
 
 def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
-    """Start a loaded unit as systemctl start does: a running dataflow keeps running."""
+    """Start a loaded unit as systemctl start does: a running dataflow keeps running.
+
+    Raises DoraSystemdError (NAME_IN_USE) for one that is about to end.
+    """
     file = cell.options.dataflow
+    if cell.state.active == "deactivating":
+        message, hint = f"cannot start {cell.name}: it is stopping", f"doractl list {cell.name}"
+        raise DoraSystemdError(message, f"{hint} shows what it waits for", ExitCode.NAME_IN_USE)
     if cell.has_begun:
         text = f"Dataflow already running: {cell.uuid} ({cell.name})"
         details = {"file": file, "is_ready": cell.state.active == "active"}

@@ -145,11 +145,19 @@ def _stop(bus: Bus, scope: Scope, cells: list[Cell], most: int) -> int:
         return print_outcomes(stop_cells_within(bus, scope, cells, most))
     try:
         outcomes = _wait(bus, scope, cells)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         if not any(one.known_options and one.known_options.by_node("stop") for one in cells):
-            raise
+            raise _interruption(cells) from error
         outcomes = _wait_on(scope, cells)
     return print_outcomes(outcomes)
+
+
+def _interruption(cells: Sequence[Cell]) -> DoraSystemdError:
+    names = " ".join(cell.name for cell in cells)
+    hint = f"doractl stop {names} waits again, with --now it kills what still runs"
+    return DoraSystemdError(
+        f"interrupted; the stop of {names} continues", hint, ExitCode.INTERRUPTED
+    )
 
 
 def _wait(bus: Bus, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:

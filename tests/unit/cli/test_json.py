@@ -90,6 +90,14 @@ def test_outcomes(capsys: Printed) -> None:
     assert (other["name"], other["result"]) == ("other", "unchanged")
 
 
+def test_a_start_of_what_is_stopping(manager: FakeManager, capsys: Printed) -> None:
+    """It does not run on, so this is no success."""
+    manager.add(options("ending", UUID[:-1] + "2"), active="deactivating")
+    found = error(capsys, "--system", "start", "ending", "-o", "json")
+    assert found["message"] == "cannot start ending: it is stopping"
+    assert found["exit_status"] == ExitCode.NAME_IN_USE
+
+
 def test_an_outcome_with_a_problem(manager: FakeManager, capsys: Printed) -> None:
     manager.job_results[UNIT] = "canceled"
     (outcome,) = objects(capsys, "restart", "robot", status=ExitCode.FAILURE)
