@@ -114,7 +114,10 @@ class Screen:
                 raise _Ended(number)
         if signal.SIGTSTP in numbers:
             curses.endwin()
-            os.kill(os.getpid(), signal.SIGSTOP)
+            # Not SIGSTOP: the kernel ignores this one if no shell can continue us, as over ssh.
+            signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+            os.kill(os.getpid(), signal.SIGTSTP)
+            signal.signal(signal.SIGTSTP, _ignored)
         # After SIGWINCH and SIGCONT, the terminal may show anything.
         self._window.clearok(any(numbers))
 

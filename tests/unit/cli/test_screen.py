@@ -54,11 +54,20 @@ class Terminal:
     written.
     """
 
-    def __init__(self, script: str, rows: int = 8, columns: int = 60, **environment: str) -> None:
+    def __init__(
+        self,
+        script: str,
+        rows: int = 8,
+        columns: int = 60,
+        has_shell: bool = True,
+        **environment: str,
+    ) -> None:
         self.fd, theirs = os.openpty()
         fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", rows, columns, 0, 0))
         self.pid = os.fork()
         if not self.pid:
+            # The kernel stops no program that has nobody to continue it, see setpgid(2).
+            os.setpgid(0, 0) if has_shell else os.setsid()
             for stream in range(3):
                 os.dup2(theirs, stream)
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
@@ -152,6 +161,18 @@ def test_suspended_and_back(terminal: Terminal) -> None:
     os.kill(terminal.pid, signal.SIGCONT)
     terminal.wait_for(ENTER)
     terminal.wait_for(SIZE)
+    os.write(terminal.fd, b"q")
+    assert terminal.end() == 0
+
+
+def test_without_a_shell_it_is_not_suspended() -> None:
+    """As by doractl -H: nobody could continue it, and the terminal would take no key."""
+    terminal = Terminal(SCRIPT, has_shell=False)
+    terminal.wait_for(SIZE)
+    os.kill(terminal.pid, signal.SIGTSTP)
+    terminal.wait_for(LEAVE)
+    os.write(terminal.fd, b"c")
+    terminal.wait_for(b"c\r")
     os.write(terminal.fd, b"q")
     assert terminal.end() == 0
 
