@@ -176,16 +176,16 @@ def command(
       doractl logs robot --run -1 --events    what happened to the run before
       journalctl -t robot/camera              the same, with systemd's own tool
     """
+    _require_end(options["until"], options["is_follow"] and not until_end)
     scope = current_scope()
     is_shared = len(selectors) == 1 and has_unit(unit_places(scope, os.environ), LINK_PREFIX)
     if (machine or is_shared) and (status := _print_machines(scope)) is not None:
         return status
     options.pop("all_nodes")
     options["level"] = parse_level(options["level"]) if options["level"] else ""
-    tail = last_count(counts)
     check_readable(scope)
     journal = JournalReader()
-    wanted = LogQuery(scope, tail=tail, levels=parse_filter(log_filter), **options)
+    wanted = LogQuery(scope, tail=last_count(counts), levels=parse_filter(log_filter), **options)
     query = find_soon(
         lambda: find_query(JournalReader(), wanted, selectors, nodes, run), scope, selectors
     )
@@ -201,6 +201,12 @@ def command(
         return _exit_status(_print(query, lines))
     print_paged(read_logs(query, lines, wants_colors(sys.stdout)))
     return ExitCode.OK
+
+
+def _require_end(until: str, is_follow: bool) -> None:
+    if until and is_follow:
+        message = "cannot use --follow with --until: journalctl --follow never ends"
+        raise usage_error(message, "leave one of them out, or use --until-end")
 
 
 def _print_machines(scope: Scope) -> int | None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dora_systemd.cli.group import doractl
+from dora_systemd.cli.group import doractl, run_verb
 from dora_systemd.cli.verbs.look.logs import command, last_count
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -51,4 +51,12 @@ def test_numbers(values: tuple[str, ...], count: str) -> None:
 def test_no_number(value: str) -> None:
     with pytest.raises(DoraSystemdError) as caught:
         last_count((value,))
+    assert caught.value.code is ExitCode.USAGE
+
+
+@pytest.mark.parametrize("words", ["-f --until now robot", "--until 5m --follow"])
+def test_what_follows_has_no_last_moment(words: str) -> None:
+    """journalctl 257 prints what there is up to then, and waits forever."""
+    with pytest.raises(DoraSystemdError, match="cannot use --follow with --until") as caught:
+        run_verb(["logs", *words.split()])
     assert caught.value.code is ExitCode.USAGE
