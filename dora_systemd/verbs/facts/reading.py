@@ -12,7 +12,7 @@ from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, Usage
-from dora_systemd.decisions.views.dataflows import FROZEN
+from dora_systemd.decisions.views.dataflows import FROZEN, stage_of_text
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
@@ -30,6 +30,9 @@ ENDED = "InactiveEnterTimestamp"
 PROCESS_STARTED = "ExecMainStartTimestamp"
 _TEXT, _READY_AT = "StatusText", "ActiveEnterTimestamp"
 _ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, _TEXT, _READY_AT, PROCESS_STARTED)
+
+_NO_TABLE = CellStatus()
+"""What a caller reads who may not read the table: systemd has its text."""
 
 
 class Reading(NamedTuple):
@@ -98,6 +101,8 @@ def read_dataflow(
         from dora_systemd.verbs.facts.budget import without_refused
 
         unit["NRestarts"] = without_refused(manager, cell, unit["NRestarts"])
+    if cell.is_up and status == _NO_TABLE:
+        status = status._replace(stage=stage_of_text(unit.get(_TEXT, "")))
     if not cell.is_up or not (path or unit["ControlGroup"]):
         return Reading(cell, unit, status, problem)
     path = path or cgroup.group_path(unit["ControlGroup"])
@@ -166,6 +171,7 @@ def _missing(
     names = ["NRestarts", UP_SINCE] if path else ["NRestarts", UP_SINCE, "ControlGroup"]
     # Not needed for a running unit whose runner has samples, which are younger.
     names += [] if cell.state.active in SETTLED and status.samples else [STARTED]
+    names += [_TEXT] if is_row and status == _NO_TABLE else []
     return [name for name in (*names, *more) if name not in known]
 
 

@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.cell.status import UNMET, CellStatus, NodeStatus
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, stage
 from dora_systemd.decisions.resources.usage import LineCount
+from dora_systemd.decisions.views.dataflows import stage_of_text
 from dora_systemd.decisions.watchdog.messages import Sign
 
 
@@ -41,6 +42,28 @@ def test_status_lines() -> None:
     ]
     for one, expected in lines:
         assert format_status(one) == expected
+
+
+def test_the_stage_is_in_the_status_line() -> None:
+    """Another user reads it there: the table is the dataflow's own."""
+    silent = Cell(0, 0, {"a": NodeStatus("running", silent="nothing came")}, State.RUNNING)
+    lacks = {"a": NodeStatus("running"), "b": NodeStatus("waiting", needs="/dev/video0")}
+    unmet = Cell(0, 0, lacks, State.RUNNING)
+    shown = {
+        "degraded": [
+            cell(State.RUNNING, a="running", b="failed"),
+            cell(State.RUNNING, a="restarting", b="failed", c="finished"),
+            silent,
+        ],
+        UNMET: [unmet],
+        "stopping": [cell(State.STOPPING, a="running"), cell(State.LEAVING)],
+        "gathering": [replace(cell(State.GATHERING), machine="gpu")],
+    }
+    for name, cells in shown.items():
+        for one in cells:
+            assert (stage_of_text(format_status(one)), stage(one)) == (name, name)
+    for one in (cell(State.RUNNING, a="running", b="finished"), cell(State.WAITING, a="failed")):
+        assert stage_of_text(format_status(one)) == "starting"
 
 
 @pytest.mark.parametrize(("more", "end"), [(0, ""), (1, " and 1 more"), (2, " and 2 more")])

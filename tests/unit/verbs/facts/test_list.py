@@ -464,3 +464,16 @@ def test_a_snapshot_says_what_systemd_does(manager: FakeManager, scope: Scope) -
     assert row.ready == SECOND
     alike: dict[str, Any] = {"uptime": 0, "cpu_percent": 0.0}
     assert observed.row._replace(**alike) == row._replace(**alike)
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_a_table_of_another_user_hides_no_failed_node(scope: Scope) -> None:
+    """Systemd has the text of the runner for all users."""
+    manager = FakeManager()
+    text = "1/2 nodes running; failed: plot (exit code 1)"
+    unit = manager.add(options(), ControlGroup=GROUP, StatusText=text)
+    for row in (row_of(manager, scope), *table_of(manager, scope)):
+        assert (row.status, row.text) == ("Degraded", text)
+        assert text in format_dataflows([row])
+    manager.units[unit]["StatusText"] = "2/2 nodes running"
+    assert [row.status for row in table_of(manager, scope)] == ["Running"]
