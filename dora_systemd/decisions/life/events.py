@@ -126,6 +126,7 @@ class NodeHung(Event):
     # record, details: the life event
     record: str = "node-hung"
     details: Mapping[str, str] = field(default_factory=dict)
+    is_late: bool = False  # dora has executed the next process already
 
     @property
     def is_of_watchdog(self) -> bool:

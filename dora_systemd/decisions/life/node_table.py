@@ -230,11 +230,13 @@ def _hung(nodes: NodeTable, event: life.NodeHung) -> Change:
     """Record why a process is ended, for its exit. A process that has ended leaves no reason.
 
     dora's health check ends only processes that are ready: of another one the event comes too late.
+    So does that of a member after the exit, which dora reports by another way.
     """
     if event.node not in nodes:
         return nodes, None
     old = nodes[event.node]
-    if event.is_of_watchdog or old.is_alive:
+    is_late = event.is_late or old.state in ("restarting", "failed", "finished")
+    if not is_late and (event.is_of_watchdog or old.is_alive):
         nodes = {**nodes, event.node: old._replace(hung=event.reason)}
     return nodes, Record(event.record, event.node, {"reason": event.reason, **event.details})
 

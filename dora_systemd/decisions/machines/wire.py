@@ -120,6 +120,7 @@ class Hung:
     node: str
     reason: str
     record: str  # the life event, see NodeHung
+    pid: int = 0  # of its process there, 0 if that is not known
 
 
 @dataclass(frozen=True)
@@ -246,7 +247,7 @@ _TYPES: Mapping[str, type[Any]] = {
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 _NUMBERS = {
     *("coordinator", "zenoh", "grace", "again", "version", "tries"),
-    *("failed", "waits", "limit", "within", "most"),
+    *("failed", "waits", "limit", "within", "most", "pid"),
 }
 _LONG = {"status", "digests"}
 _BY_MACHINE = {(Forwards, "zenoh")}

@@ -335,6 +335,7 @@ class HeadDialogue(Dialogue):
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
             self._release_exit(event.node)
+            self._roster.pids[event.node] = event.pid
             event = replace(event, pid=0)  # here another process has that number
         if isinstance(event, life.NodeExited):
             essential = event.node in essential_nodes(self._options)

@@ -193,7 +193,9 @@ class Member(Shared):
     def _tell_hung(self, event: life.Event) -> None:
         """Report to the head why a node was ended, before dora reports the end of the node."""
         if isinstance(event, life.NodeHung):
-            self.send(wire.Hung(event.node, event.reason, event.record))
+            nodes = self._pump.cell.nodes if self._pump else {}
+            pid = nodes.get(event.node, NodeStatus()).pid
+            self.send(wire.Hung(event.node, event.reason, event.record, pid))
 
     def _send_table(self) -> None:
         """Send the table, if it has changed since the last heartbeat."""

@@ -102,6 +102,7 @@ class Roster:
         # Whether a person waits for this start, and can repair what a machine at its boot cannot.
         self.is_awaited = self._is_closed = False
         self._taken = 0
+        self.pids: dict[str, int] = {}  # by node, there: of the last process that dora reported
         # Takes the events; set before the first connection.
         self.push: Callable[[life.Event], None] = lambda _: None
         # Takes the digests of what the nodes of a member run.
@@ -290,7 +291,9 @@ class Roster:
         is_own = placed_on(self._options.placed, message.node) == name
         if is_own and message.record in _HUNG:
             reason = short_line(message.reason, _LONGEST)
-            self.push(life.NodeHung(now_us(), message.node, reason, message.record))
+            is_late = message.pid not in (0, self.pids.get(message.node, message.pid))
+            event = life.NodeHung(now_us(), message.node, reason, message.record, is_late=is_late)
+            self.push(event)
 
     def _take_others(self, name: str, message: wire.Taken) -> None:
         """Start a new run with other ports, or give up after _MOST_TAKEN attempts in a row."""

@@ -121,6 +121,19 @@ CASES: dict[str, tuple[NodeStatus, life.Event, NodeStatus, tuple[Record, ...]]] 
         )
         for state, pid in (("restarting", 0), ("starting", 8), ("reloading", 7), ("failed", 0))
     },
+    **{
+        f"missed its watchdog, but {what}": (
+            RUNS._replace(state=state, pid=0),
+            life.NodeHung(20, "a", "unresponsive", "node-watchdog", is_late=is_late),
+            RUNS._replace(state=state, pid=0),
+            (Record("node-watchdog", "a", {"reason": "unresponsive"}),),
+        )
+        for what, state, is_late in (
+            ("the next process runs by now", "running", True),
+            ("its end is known", "restarting", False),
+            ("has failed by now", "failed", False),
+        )
+    },
     "the end of a hung one": (
         RUNS._replace(hung="unresponsive"),
         exited(exit_of(-9)),

@@ -345,6 +345,7 @@ def test_a_pid_of_another_machine_means_nothing_here(tmp_path: Path) -> None:
         bench.dialogue._hear(LogRecord("DEBUG", *MID, said))
         bench.dialogue._hear(LogRecord("INFO", *MID, "its next words"))
         assert bench.heard(life.NodeSpawned) == [life.NodeSpawned(0, "mid", 0)]
+        assert bench.roster.pids == {"mid": 1}
         assert bench.heard(life.NodeExited) == [life.NodeExited(0, "mid", exit_of(-9), False)]
         assert bench.nodes.calls == [], "no process here is touched"
 

@@ -436,7 +436,7 @@ def test_the_head_hears_why_a_node_is_ended(tmp_path: Path) -> None:
         bench.pump.on_event(life.NodeHung(0, "mid", "no sign of life for 5s", "node-watchdog"))
         bench.pump.on_event(life.NodeReady(0, "mid"))
         told = {"node": "mid", "reason": "no sign of life for 5s", "record": "node-watchdog"}
-        assert other.heard() == [{"type": "hung", **told}]
+        assert other.heard() == [{"type": "hung", **told, "pid": 7}]
 
     run(tmp_path, work)
 

@@ -442,6 +442,19 @@ def test_why_a_member_ends_a_node(word: wire.Hung, is_believed: bool) -> None:
     run(work)
 
 
+def test_a_late_report_is_not_about_the_next_process() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        bench.roster.pids["mid"] = 8
+        words = ("mid", "no sign of life for 5s", "node-watchdog")
+        other.say(READY, wire.Hung(*words, 7), wire.Hung(*words, 8), wire.Hung(*words))
+        await settle()
+        late = [one.is_late for one in bench.heard() if isinstance(one, life.NodeHung)]
+        assert late == [True, False, False]
+
+    run(work)
+
+
 def test_the_time_left_of_a_node_there_is_shown_by_the_clock_here() -> None:
     """A member can send any number, and `list` must read the table of the head."""
     there = CellStatus(stop_dues={"mid": 3, "flood": 2**63 - 1})
