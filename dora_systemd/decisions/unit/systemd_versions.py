@@ -61,23 +61,25 @@ _SILENT = {
 
 
 def drop_unsupported(
-    properties: Properties, systemd_version: int
+    properties: Properties, systemd_version: int, given: tuple[str, ...] = ()
 ) -> tuple[dict[str, Property], tuple[str, ...]]:
     """The properties that this systemd supports, and a warning for each other one that matters.
 
+    given: the assignments of --property, whose values are not ours.
     Raises DoraSystemdError (NO_SYSTEMD) below version 252.
     """
     if systemd_version < MIN_VERSION:
         message = f"cannot use systemd {systemd_version}: it is too old"
         hint = f"dora-systemd needs systemd {MIN_VERSION} or newer"
         raise DoraSystemdError(message, hint, ExitCode.NO_SYSTEMD)
+    keys = {one.partition("=")[0] for one in given}
     kept = {slot: one for slot, one in properties.items() if _since(one) <= systemd_version}
     dropped = {slot: one for slot, one in properties.items() if slot not in kept}
     warnings = tuple(
         f"{slot.removesuffix('~')}= is left out: systemd {systemd_version} lacks it, "
         f"version {_since(one)} has it"
         for slot, one in dropped.items()
-        if one.value != _SILENT.get(slot)
+        if one.value != _SILENT.get(slot) or slot in keys
     )
     return kept, warnings
 

@@ -52,7 +52,8 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     check_needs(manager, Needy(plan.options.name, plan.scope.is_user, needs))
     number = systemd_number(manager)
     check_units(manager, plan.scope, plan.options)
-    properties, warnings = drop_unsupported(_properties(plan, lambda: manager), number)
+    wanted = _properties(plan, lambda: manager)
+    properties, warnings = drop_unsupported(wanted, number, plan.settings[PROPERTY])
     warnings = (
         *warnings,
         *passed_on(plan, number),

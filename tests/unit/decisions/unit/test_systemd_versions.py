@@ -41,6 +41,16 @@ def test_what_is_newer_is_left_out_with_a_warning(assignment: str, version: int)
     assert drop_unsupported(given, version) == (given, ())
 
 
+def test_a_value_of_ours_is_left_out_with_a_warning_if_it_is_given() -> None:
+    text = "FileDescriptorStorePreserve=yes"
+    wanted = properties(text)
+    assert drop_unsupported(wanted, 253) == ({}, ())
+    assert [one.partition("=")[0] for one in drop_unsupported(wanted, 253, (text,))[1]] == [
+        "FileDescriptorStorePreserve"
+    ]
+    assert drop_unsupported(wanted, 254, (text,)) == (wanted, ())
+
+
 def test_the_subgroup_is_the_runners_work_on_debian_12() -> None:
     given = {"DelegateSubgroup": Property("DelegateSubgroup", "s", "supervisor")}
     assert drop_unsupported(given, 253) == ({}, ())
