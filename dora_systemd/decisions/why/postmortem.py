@@ -175,7 +175,8 @@ def _crash(crash: Happening) -> Verdict:
 
 def _end(life: Life, facts: Facts, shutdowns: Sequence[int]) -> Verdict:
     if (failure := life.last("dataflow-failed")) is not None:
-        if failure.detail("reason") == BY_SIGKILL and life.last("stop-asked") is not None:
+        asked = life.last("stop-asked")  # later ones call a restart off
+        if failure.detail("reason") == BY_SIGKILL and asked and asked.at_us <= failure.at_us:
             by = stopped_by(life, shutdowns)  # with --now
             return _found(Cause.STOPPED, f"stopped by {by}; killed", failure, by=by)
         return _failure(life, failure)

@@ -208,6 +208,11 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
          failed("runner-killed", "the supervisor process was killed (SIGKILL)")),
         *("Stopped", Cause.STOPPED, "", "stopped by root (doractl stop); killed"),
     ),
+    "killed, and its restart was called off": (
+        (*RUNS, failed("runner-killed", "the supervisor process was killed (SIGKILL)"),
+         event("stop-asked", life="session", by="root (doractl stop)"), JOB),
+        *("Failed", Cause.RUNNER_KILLED, "", "the supervisor process was killed (SIGKILL)"),
+    ),
     "crashed during a stop": (
         (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, STOPPED[0],
          failed("runner-killed", "the supervisor process was killed (SIGSEGV)")),
