@@ -166,7 +166,7 @@ def plan_emulator(_form: str) -> list[Step]:
 
 
 def build_step() -> Step:
-    return Step("Debian packages", ["packaging/build"], os.environ.copy, minutes=4)
+    return Step("Debian packages", ["packaging/build"], os.environ.copy, minutes=2)
 
 
 def reboot_step() -> Step:
