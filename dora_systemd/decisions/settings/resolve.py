@@ -204,7 +204,7 @@ def _parsed_in_file(setting: Setting[Any], value: object, source: str) -> Any:
         return setting.kind.parse(value, base if base.is_absolute() else None)
     except DoraSystemdError as error:
         place = (setting.name, *_inner(error))
-        message = f"{error.message} ({'.'.join(place)} in {shown(source)}"
+        message = f"{error.message} ({'.'.join(map(shown, place))} in {shown(source)}"
         raise WrongKey(message, error.hint, source, place, end=")") from error
 
 

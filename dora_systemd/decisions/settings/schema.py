@@ -23,7 +23,7 @@ from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.nodes import NODES
 from dora_systemd.errors import DoraSystemdError, WrongKey
 from dora_systemd.names import did_you_mean
-from dora_systemd.values import as_mapping, quoted
+from dora_systemd.values import as_mapping, quoted, shown
 
 # strict: pydantic must not convert between lists, texts and booleans; the kinds parse texts.
 # Debian 12 and Ubuntu 24.04 have pydantic 1.10, which has strict types but no strict models.
@@ -88,7 +88,7 @@ def validation_error(
         expected = settings[key].kind.expected if key in settings else "a mapping"
         hint = f"write {expected}"
         if key in _OF_TEXTS and (entry := _entry(place)):
-            place, key, hint = [key, entry], f"{key}.{entry}", "write it as text, in quotes"
+            place, key, hint = [key, entry], f"{key}.{shown(entry)}", "write it as text, in quotes"
         reason = f"the value of {key} is of another type"
     refused = refusal(source, reason, hint)
     return WrongKey(refused.message, refused.hint, source, place)

@@ -169,6 +169,7 @@ def test_a_numeric_user_is_a_text() -> None:
         ({"env": {"A": [1]}}, "the value of env.A is of another type", "in quotes"),
         ({"env": {"B": "1", "A": None}}, "the value of env.A is of another type", "in quotes"),
         ({"property": {"Nice": None}}, "the value of property.Nice is of another type", "quotes"),
+        ({"env": {"\b": None}}, r"the value of env.'\x08' is of another type", "in quotes"),
         ({"venv": {"a": 1}}, "the value of venv is of another type", "a path"),
         ({"property": 5}, "the value of property is of another type", "PROPERTY: VALUE"),
     ],
