@@ -184,14 +184,6 @@ def _device_kind(amount: PropertyKind, expected: str) -> PropertyKind:
     return items_kind("a(st)", expected, parse_device, format_device)
 
 
-def _parse_hostname(text: str) -> Pair:
-    """`private` is a UTS namespace whose hostname the processes may change."""
-    word, colon, name = plain_text(text).partition(":")
-    if word != "private" or bool(colon) != bool(name):
-        raise ValueError(text)
-    return word, name
-
-
 COMMAND = PropertyKind(
     "a(sasas)",
     "a command line with an absolute path, such as /usr/bin/touch /run/x",
@@ -228,11 +220,5 @@ ADDRESSES = PropertyKind(
     "networks such as 10.0.0.0/8, or any, localhost, link-local, multicast",
     _parse_addresses,
     _format_addresses,
-)
-HOSTNAME = PropertyKind(
-    "(ss)",
-    "yes, no, private or private:HOSTNAME",
-    _parse_hostname,
-    lambda pair: escape_specifiers(_joined(pair, ":")),
 )
 CPUS = PropertyKind("ay", "a set of numbers such as 0-3,8", _parse_cpus, _format_cpus)

@@ -66,7 +66,7 @@ _NUMBER = number_kind("u", 0, 2**32 - 1)
 _BOOLS = """
     CPUAccounting MemoryAccounting IOAccounting TasksAccounting IPAccounting NoNewPrivileges
     PrivateDevices PrivateNetwork PrivateMounts PrivateIPC ProtectKernelTunables
-    ProtectKernelModules ProtectKernelLogs ProtectClock MemoryDenyWriteExecute
+    ProtectKernelModules ProtectKernelLogs ProtectClock ProtectHostname MemoryDenyWriteExecute
     RestrictRealtime RestrictSUIDSGID LockPersonality DynamicUser RemoveIPC MountAPIVFS
     CPUSchedulingResetOnFork IgnoreSIGPIPE SyslogLevelPrefix SendSIGHUP SendSIGKILL TTYReset
     TTYVHangup TTYVTDisallocate RootDirectoryStartOnly RemainAfterExit RootEphemeral MemoryKSM
@@ -232,7 +232,6 @@ _EXTENDED = {
     "PrivateTmp": choice_kind("disconnected"),
     "PrivateUsers": choice_kind("self", "identity", "full"),
     "ProtectControlGroups": choice_kind("private", "strict"),
-    "ProtectHostname": structs.HOSTNAME,
 }
 """Booleans at first; for later values there is a second property on D-Bus."""
 

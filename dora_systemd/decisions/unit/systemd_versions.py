@@ -37,7 +37,6 @@ _ADDED: Mapping[int, tuple[str, ...]] = {
         *("PrivateTmpEx", "BindLogSockets", "ProtectControlGroupsEx"),
         *("PrivateUsersEx", "PrivatePIDs", "ManagedOOMMemoryPressureDurationUSec"),
     ),
-    258: ("ProtectHostnameEx",),
 }
 """Names on D-Bus by the first version that has them: HISTORY in org.freedesktop.systemd1(5)."""
 
