@@ -1,7 +1,9 @@
-"""A listener, for tests of who is at the other end."""
+"""A listener, for tests of who is at the other end; and a directory for several users."""
 
 import socket
 from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -16,3 +18,11 @@ def tcp_listener(host: str) -> Iterator[socket.socket]:
             pytest.skip(f"no {host} on this machine")
         one.listen()
         yield one
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """Where everybody may look: pytest's directories are closed, anew whenever a pytest begins."""
+    with TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        yield Path(name)

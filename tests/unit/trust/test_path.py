@@ -17,18 +17,16 @@ NOBODY = 65534
 
 
 @pytest.fixture
-def has_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def has_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """What exists once a program of the first directory in PATH has run, which is nobody's."""
-    for one in (tmp_path, *list(tmp_path.parents)[:2]):
-        one.chmod(0o755)
-    place, mark = tmp_path / "bin", tmp_path / "mark"
-    place.mkdir()
+    programs, mark = place / "bin", place / "mark"
+    programs.mkdir()
     for name in ("ssh", "sh", "journalctl", "less", "rsync"):
-        program = place / name
+        program = programs / name
         program.write_text(f"#!/bin/sh\ntouch {mark}\n")
         program.chmod(0o755)
-    os.chown(place, NOBODY, NOBODY)
-    monkeypatch.setenv("PATH", f"{place}:{os.environ['PATH']}")
+    os.chown(programs, NOBODY, NOBODY)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
     monkeypatch.setenv("TERM", "xterm")
     yield mark
 

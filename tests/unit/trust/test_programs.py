@@ -4,7 +4,6 @@ import os
 import pwd
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,14 +21,6 @@ from dora_systemd.trust.programs import (
 
 root_only = pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
 NOBODY = 65534
-
-
-@pytest.fixture
-def place(tmp_path: Path) -> Iterator[Path]:
-    """Where everybody may look: pytest's own directories are closed."""
-    for one in (tmp_path, *list(tmp_path.parents)[:2]):
-        one.chmod(0o755)
-    yield tmp_path
 
 
 def script(path: Path, text: str = "#!/bin/sh\n", owner: int = 0) -> str:

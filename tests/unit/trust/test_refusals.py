@@ -163,14 +163,6 @@ def program(path: Path, first: str, mode: int = 0o755) -> str:
     return str(path)
 
 
-@pytest.fixture
-def place(tmp_path: Path) -> Path:
-    """Where everybody may look: pytest's own directories are closed."""
-    for one in (tmp_path, *list(tmp_path.parents)[:2]):
-        one.chmod(0o755)
-    return tmp_path
-
-
 @root_only
 def test_a_program_that_others_can_change(place: Path) -> None:
     theirs = program(place / "theirs", "#!/bin/sh", 0o757)
