@@ -1,11 +1,9 @@
 """The table of `doractl list`, from facts of systemd and the runner."""
 
-import re
 from collections.abc import Sequence
 from itertools import pairwise
 
-from dora_systemd.decisions.cell.status import GATHERING, STAGES, UNMET
-from dora_systemd.decisions.needs.waiting import WAITS, format_wait
+from dora_systemd.decisions.needs.waiting import format_wait
 from dora_systemd.decisions.views.facts import SILENT, stopping_words
 from dora_systemd.decisions.views.formats import (
     UNKNOWN,
@@ -60,22 +58,6 @@ def status_word(active: str, sub: str, stage: str = "", is_held: bool = False) -
         return WAITING
     word = _BY_ACTIVE.get(active, STOPPED)
     return _BY_STAGE.get(stage, word) if word == RUNNING else word
-
-
-_COUNT = r"[0-9]+/[0-9]+ nodes "
-_TEXTS = {
-    rf"{_COUNT}running; (?:.*; )?(?:failed|silent): ": "degraded",
-    rf"{_COUNT}.*{WAITS}": UNMET,
-    "waiting for ": GATHERING,
-    "stopping": "stopping",
-}
-"""The stage by the beginning of a text."""
-
-
-def stage_of_text(text: str) -> str:
-    """Return the stage that STATUS= shows, for a caller who may not read the table."""
-    stages = (stage for begin, stage in _TEXTS.items() if re.match(begin, text))
-    return next(stages, STAGES[0])
 
 
 def shortest_prefixes(uuids: Sequence[str]) -> dict[str, str]:

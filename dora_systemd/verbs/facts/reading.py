@@ -12,7 +12,8 @@ from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.resources.usage import WHOLE_CELL, CpuSample, Usage
-from dora_systemd.decisions.views.dataflows import FROZEN, stage_of_text
+from dora_systemd.decisions.views.dataflows import FROZEN
+from dora_systemd.decisions.views.stages import stage_of_text
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope

@@ -9,7 +9,7 @@ from dora_systemd.decisions.cell.status import UNMET, CellStatus, NodeStatus
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, stage
 from dora_systemd.decisions.resources.usage import LineCount
-from dora_systemd.decisions.views.dataflows import stage_of_text
+from dora_systemd.decisions.views.stages import stage_of_text
 from dora_systemd.decisions.watchdog.messages import Sign
 
 
