@@ -15,6 +15,7 @@ from dora_systemd.decisions.gateway.answers import (
     node_list,
     stopped,
 )
+from dora_systemd.decisions.life.causes import BY_SIGKILL
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Report
@@ -93,7 +94,9 @@ def check(scope: Scope, uuid: str) -> dict[str, Any]:
 def ended_result(scope: Scope, uuid: str) -> dict[str, Any]:
     """Return the reply for an ended dataflow, with the node's last lines, or raise its error."""
     report = explain(Bus(scope, for_reading=True), scope, uuid, JournalReader())
-    failed = report.verdict.status == FAILED
+    # As with dora, a stop whose grace duration was over is a failure of the node.
+    is_killed = report.verdict.details.get("reason") == BY_SIGKILL
+    failed = report.verdict.status == FAILED or is_killed
     failures = {report.verdict.node or report.subject.name: _account(report)} if failed else {}
     return stopped(uuid, time.time_ns() // 1000, failures)
 
