@@ -1,4 +1,4 @@
-"""A listener, for tests of who is at the other end; and a directory for several users."""
+"""A socket that listens, and a directory that every user can read."""
 
 import socket
 from collections.abc import Iterator
@@ -22,7 +22,10 @@ def tcp_listener(host: str) -> Iterator[socket.socket]:
 
 @pytest.fixture
 def place() -> Iterator[Path]:
-    """Where everybody may look: pytest's directories are closed, anew whenever a pytest begins."""
+    """A directory that every user can read.
+
+    tmp_path is not: pytest makes its parent private, again at each start of another pytest.
+    """
     with TemporaryDirectory() as name:
         Path(name).chmod(0o755)
         yield Path(name)
