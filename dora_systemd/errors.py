@@ -51,6 +51,11 @@ class DoraSystemdError(Exception):
         self.hint = " ".join(hint.split())
         self.code = code
 
+    @property
+    def is_refused(self) -> bool:
+        """Whether the kernel refused the caller a file, so that root could do it."""
+        return isinstance(self.__cause__, PermissionError)
+
 
 def usage_error(message: str, hint: str = "") -> DoraSystemdError:
     """The error for a command line, or a value in it, that is not valid."""

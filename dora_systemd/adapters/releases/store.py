@@ -138,7 +138,7 @@ class Store:
         try:
             return count_damaged(read_lines(self.path / HISTORY, MAX_BYTES))
         except DoraSystemdError as error:
-            if isinstance(error.__cause__, PermissionError):
+            if error.is_refused:
                 return 0
             raise
 
@@ -174,7 +174,7 @@ class Store:
         try:
             return read_file(self.release(release_id) / name, most).data.decode("utf-8", "replace")
         except DoraSystemdError as error:
-            if isinstance(error.__cause__, PermissionError):
+            if error.is_refused:
                 raise
             hint = f"deploy again, or choose another release: doractl releases {self.name}"
             raise bad_input(error.message, hint) from error

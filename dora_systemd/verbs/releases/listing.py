@@ -85,7 +85,7 @@ def read_history(manager: Manager, scope: Scope, name: str) -> list[Switch]:
     try:
         return read_past(store_of(scope, name), current)[::-1]
     except DoraSystemdError as error:
-        if not isinstance(error.__cause__, PermissionError):
+        if not error.is_refused:
             raise
         raise DoraSystemdError(error.message, "use sudo", ExitCode.NO_PERMISSION) from error
 
