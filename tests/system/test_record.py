@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import signal
 import tarfile
 from functools import partial
 from pathlib import Path
@@ -155,6 +156,27 @@ def test_it_is_changed_while_it_runs(cell: Cell, project: Project) -> None:
     cell.doractl("restart", cell.name)
     wait_for("it goes on", partial(has_more, 20))
     assert Ring().reading().header.budget == 4 * 1024 * 1024
+
+
+def freeze(cell: Cell) -> None:
+    """Stop the process of the recorder: it ends within no grace, as on a machine that is busy."""
+    for pid in cell.pids("node-dora-systemd-recorder"):
+        os.kill(pid, signal.SIGSTOP)
+
+
+@pytest.mark.warns(LARGE, "killed on drop")
+def test_one_that_ends_too_late_is_no_failure(cell: Cell, project: Project) -> None:
+    path = flow(project, {"memory": "8M", "outputs": ["camera/image"]})
+    start(cell, path, "--grace-duration", "1s")
+    wait_for("it records", partial(has_more, 5))
+    freeze(cell)
+    cell.doractl("set", cell.name, "--record", "off")
+    wait_for("it is gone", lambda: not cell.pids("node-dora-systemd-recorder"))
+    cell.doractl("set", cell.name, "--record", "memory=4M")
+    wait_for("it records again", partial(has_more, 5))
+    freeze(cell)
+    cell.doractl("stop", cell.name)
+    assert cell.doractl("why", cell.name).stdout.startswith(f"{cell.name}: Stopped\n")
 
 
 FAST = """

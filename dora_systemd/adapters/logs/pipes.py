@@ -64,6 +64,7 @@ class LogPipes:
         self.left_out: tuple[bytes, ...] = ()  # lines that contain one of these are left out
         self._muted: frozenset[str] = frozenset()
         self._asked: set[str] = set()  # nodes whose end was requested
+        self._expected: tuple[str, ...] = ()
         self._lost = 0
 
     def make(self, node_id: str, paths: CellPaths) -> None:
@@ -229,6 +230,10 @@ class LogPipes:
             if label not in self._readers or not self._read_output(label, *self._readers[label]):
                 return
 
+    def expect_ends(self, prefix: str) -> None:
+        """Leave out what dora's daemon prints about the end of nodes whose id begins so."""
+        self._expected += (prefix,)
+
     def mute(self, *labels: str) -> None:
         """Write no records of what these children print; replaces the labels given before."""
         self._muted = frozenset(labels)
@@ -320,7 +325,7 @@ class LogPipes:
         for line in self._outputs[fd].feed(data) if data else self._outputs[fd].flush():
             is_muted = label in self._muted or any(map(line.__contains__, self.left_out))
             fields = None if is_muted else dora_log_fields(line)
-            if fields and not is_end_of(str(fields["MESSAGE"]), self._asked):
+            if fields and not is_end_of(str(fields["MESSAGE"]), self._asked, self._expected):
                 self._queue.put_record(label, self._entry(fields, label))
             if on_line is not None:
                 on_line(line.decode("utf-8", "replace"))

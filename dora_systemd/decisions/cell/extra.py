@@ -17,6 +17,8 @@ EXTRA = (PROBE, RECORDER)
 # The daemon sends a message to its receivers in the order of their ids. With an id at the end of
 # this order a recorder adds 10 % to the latency of 64 B, and 20 % with one before it.
 _LAST = "zzz-"
+ID_PREFIX = f"{_LAST}dora-systemd-"
+"""Of each of them."""
 
 
 def extra_id(name: str, number: int) -> str:

@@ -25,10 +25,13 @@ def repeated(text: str, times: int) -> str:
     return f"... the same line, {times} times in all"
 
 
-def is_end_of(text: str, nodes: Collection[str]) -> bool:
-    """Return whether a recorded line of dora's daemon reports that one of `nodes` has failed."""
-    match = re.search(_END_OF_NODE, text) if nodes else None
-    return match is not None and match[1] in nodes
+def is_end_of(text: str, nodes: Collection[str], prefixes: tuple[str, ...] = ()) -> bool:
+    """Return whether a recorded line of dora's daemon reports that one of `nodes` has failed.
+
+    prefixes: of the ids of further nodes.
+    """
+    match = re.search(_END_OF_NODE, text) if nodes or prefixes else None
+    return match is not None and (match[1] in nodes or match[1].startswith(prefixes))
 
 
 def is_told_by_event(origin: bytes, text: bytes) -> bool:

@@ -12,7 +12,7 @@ from typing import Any
 from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
-from dora_systemd.decisions.cell.extra import PROBE, RECORDER, is_extra
+from dora_systemd.decisions.cell.extra import ID_PREFIX, PROBE, RECORDER, is_extra
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.rights import essential_nodes, rights_of
 from dora_systemd.decisions.cell.status import NodeStatus
@@ -296,6 +296,7 @@ class Dialogue(Tasks):
 
     async def _ask_stop(self) -> None:
         self._nodes.let_go()
+        self._pipes.expect_ends(ID_PREFIX)
         cell = self._pump.cell
         if lacking(cell.nodes) or held(cell.nodes):
             self.spawn("end the nodes that wait", self._end_waiting(cell))

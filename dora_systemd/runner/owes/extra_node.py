@@ -78,7 +78,7 @@ class ExtraNode:
 
     async def remove(self, grace: int) -> None:
         """Have dora end the node, and kill it if dora does not. grace: µs."""
-        ident = extra_id(self._name, self.count)
+        ident = self._expect_end()
         params = protocol.node_params("RemoveNode", self._run.pump.cell.run, ident, grace)
         try:
             reply = await self._engine.ask_apart(params, _ANSWER_SECONDS)
@@ -88,7 +88,17 @@ class ExtraNode:
             self.kill()
 
     def kill(self) -> None:
+        self._expect_end()
         cgroup.kill_group(self.group)
+
+    def _expect_end(self) -> str:
+        """Leave out how the node ends, and return its id.
+
+        On a busy machine it may get no CPU time within the grace duration.
+        """
+        ident = extra_id(self._name, self.count)
+        self._run.pipes.expect_ends(ident)
+        return ident
 
 
 def can_come(node: NodeStatus | None) -> bool:

@@ -131,11 +131,12 @@ with the lowest priority slow the other consumers down ten times and more, and 4
 _TICK = SECOND
 _LONGEST_PAUSE = 8 * SECOND
 """µs in which nothing is recorded, if recorders end again and again."""
-_GRACE = SECOND
+_GRACE = 5 * SECOND
+"""dora's own when it restarts a node."""
 _PATIENCE = 3
 """Ticks in which a recorder without inputs ends by itself."""
-_WEIGHT = 10
-"""cpu.weight; other groups have 100."""
+_WEIGHT, _LAST_WEIGHT = 10, 100
+"""cpu.weight while it records, and while it ends; other groups have 100."""
 _VARIABLES = {"RUST_LOG": "warn", "MALLOC_MMAP_THRESHOLD_": "262144"}
 """dora prints which messages it drops. What large messages have used is given back to the system:
 glibc keeps it otherwise, 100 MB and more."""
@@ -254,6 +255,7 @@ class Recorder:
     async def end(self) -> None:
         """End the recorder, which another one replaces or nobody needs any more."""
         if self._node.is_there:
+            self._limit({"cpu.weight": str(_LAST_WEIGHT)})
             await self._node.remove(_GRACE)
 
     async def _tend(self, now: int) -> None:
@@ -281,7 +283,8 @@ class Recorder:
 
     async def _define(self, inputs: dict[str, dict[str, Any]]) -> dict[str, Any]:
         python, node = await self._find_python(), self._node
-        self._limit()
+        limit = str(limit_of(self._record, total_memory()))
+        self._limit({"memory.max": limit, "memory.swap.max": "0", "cpu.weight": str(_WEIGHT)})
         script = PACKAGE / "runner" / "recorder" / "record.py"
         path = self._run.nodes.places[1].ring
         command = [python, "-u", str(script), str(path), str(PACKAGE)]
@@ -289,13 +292,8 @@ class Recorder:
         launcher = PERL, self._plan.launcher
         return extra_definition(RECORDER, node.count, command, launcher, inputs, _VARIABLES)
 
-    def _limit(self) -> None:
+    def _limit(self, limits: Mapping[str, str]) -> None:
         """Limit the group, as far as the kernel can: some containers have no controllers."""
-        limits = {
-            "memory.max": str(limit_of(self._record, total_memory())),
-            "memory.swap.max": "0",
-            "cpu.weight": str(_WEIGHT),
-        }
         for file, text in limits.items():
             with suppress(OSError):
                 cgroup.write_text(self._node.group / file, text)

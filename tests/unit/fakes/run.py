@@ -148,6 +148,7 @@ class FakePipes(LogPipes):
         self.broken: set[str] = set()
         self.outputs: dict[str, OnLine] = {}
         self.lines: dict[str, LineCount] = {}
+        self.expected: list[str] = []
 
     def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
         if name in self.broken:
@@ -161,6 +162,9 @@ class FakePipes(LogPipes):
     def add_output(self, label: str, fd: int, on_line: OnLine = None, said: bytes = b"") -> None:
         del fd, said
         self.outputs[label] = on_line
+
+    def expect_ends(self, prefix: str) -> None:
+        self.expected.append(prefix)
 
     def mute(self, *labels: str) -> None:
         self.calls.append(("mute", *labels))

@@ -410,6 +410,10 @@ def test_whose_end_was_asked_for_is_not_told_by_the_daemon(tmp_path: Path) -> No
         os.write(writer, line.format("a").encode())
         messages = await cell.messages(2)
         assert "node_id=a" in messages[1]
+        cell.pipes.expect_ends("zzz-")
+        os.write(writer, line.format("zzz-1").encode() + line.format("c").encode())
+        (entry,) = await cell.entries(1)
+        assert "node_id=c" in entry["MESSAGE"]
         os.close(writer)
 
     run(tmp_path, scenario)

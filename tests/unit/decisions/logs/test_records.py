@@ -128,6 +128,11 @@ def test_whose_end_a_line_tells(text: str, nodes: list[str], is_one: bool) -> No
     assert is_end_of(text, nodes) is is_one
 
 
+def test_whose_end_a_line_tells_by_the_beginning_of_an_id() -> None:
+    assert is_end_of(CRASH, [], ("plot", "cam"))
+    assert not is_end_of(CRASH, [], ("plot", "amera"))
+
+
 @pytest.mark.parametrize(
     ("origin", "text", "is_told"),
     [

@@ -184,6 +184,7 @@ def test_a_stop(tmp_path: Path) -> None:
         bench.dora.answers["Stop"].append({})
         assert await bench.do(Do.ASK_STOP) == [life.StopAnswered(0)]
         assert bench.calls[:2] == [("let go",), ("ask", "Stop")]
+        assert bench.pipes.expected == ["zzz-dora-systemd-"]
         assert bench.dora.asked == [
             {
                 "Stop": {

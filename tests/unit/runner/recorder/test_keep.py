@@ -105,6 +105,20 @@ def test_a_node_of_its_own_within_limits(tmp_path: Path) -> None:
     assert bench.reasons() == []
 
 
+def test_an_end_on_request_is_no_failure_and_gets_time(tmp_path: Path) -> None:
+    async def begin() -> None:
+        await asyncio.sleep(1000)
+        bench = Bench(tmp_path)
+        await bench.work(5)
+        await bench.record.end()
+        removed: Any = bench.dora.asked[-1]["RemoveNode"]  # type: ignore[index]
+        assert (removed["node_id"], removed["grace_duration"]["secs"]) == (extra_id(RECORDER, 1), 5)
+        assert bench.pipes.expected == [extra_id(RECORDER, 1)]
+        assert (bench.group / "cpu.weight").read_text() == "100"
+
+    live(begin)
+
+
 def test_one_that_ends_again_and_again_is_reported_once(tmp_path: Path) -> None:
     bench = lived(tmp_path, 100, does_end=True)
     assert len(bench.added()) > 8
