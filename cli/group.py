@@ -246,10 +246,14 @@ def _meant_verb(name: str, verbs: Iterable[str], group: str = "") -> str:
 
 
 def _near(error: click.NoSuchOption) -> list[str]:
-    """The options that click suggests: those that are very similar, or else somewhat."""
+    """The options that begin so; or else of those that click suggests the most similar."""
     from difflib import get_close_matches
 
     word, options = error.option_name.lstrip("-"), error.possibilities or ()
+    every = error.ctx.command.params if error.ctx else []
+    longer = [one for param in every for one in param.opts if one.startswith(f"--{word}")]
+    if len(word) > 1 and longer:
+        return longer[:3]
     for least in (0.8, 0.6):
         near = [one for one in options if get_close_matches(one.lstrip("-"), [word], cutoff=least)]
         if near:

@@ -168,6 +168,7 @@ def test_every_option_says_what_it_does(name: str) -> None:
         (["node", "lits"], "unknown command 'node lits'", "valid commands: restart, stop"),
         (["node", "list"], "unknown command 'node list'", "did you mean doractl list NAME?"),
         (["machine", "ls"], "unknown command 'machine ls'", "did you mean doractl machine list?"),
+        (["start", "--grace", "1s"], "unknown option --grace", "did you mean --grace-duration?"),
         (["list", "--oll"], "unknown option --oll", "did you mean --all?"),
         (
             ["start", "--memroy-limit"],
