@@ -103,7 +103,7 @@ def ensure_foreign_room(cache: Path, kind: str, packages: Sequence[str]) -> Path
 
 def install_debian(path: Path, variant: str, packages: Sequence[str], log: Path) -> None:
     need_tools("mmdebstrap")
-    program, *words = debian_command(path, variant, list(packages))
-    command = [program, f"--architectures={FOREIGN}", "--skip=check/qemu", *words]
+    more = f"--architectures={FOREIGN}", "--skip=check/qemu"
+    command = debian_command(path, variant, list(packages), definition.SUITE, *more)
     with Stage(f"Debian {definition.SUITE} for {FOREIGN}, {len(packages)} packages"):
         run_logged(command, log, "install Debian's packages")

@@ -8,7 +8,7 @@ from pathlib import Path
 from lab import definition
 from lab.cache import Layer, ensure
 from lab.errors import LabError, Stage
-from lab.process import need_tools, run_logged
+from lab.process import die_with_parent, need_tools, run_logged
 
 CLEAN_PATH = "/opt/lab/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 # Inside the tree while it is built; /run is a tmpfs once it is booted.
@@ -57,17 +57,20 @@ def build_base(path: Path, log: Path) -> None:
 
 
 def debian_command(
-    path: Path, variant: str, packages: list[str], suite: str = definition.SUITE
+    path: Path, variant: str, packages: list[str], suite: str = definition.SUITE, *options: str
 ) -> list[str]:
     mirror = os.environ.get("LAB_MIRROR")
     # A mirror that is not updated any more has it expire, in a suite that is not released.
     expired = ["--aptopt=Acquire::Check-Valid-Until false"] if suite == definition.NEW_SUITE else []
+    # It mounts file systems below `path`, and starts apt: neither outlives a lab that is killed.
+    alone = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc"]
     return [
+        *die_with_parent(alone),
         "mmdebstrap", f"--variant={variant}", "--mode=root", "--format=directory",
         f"--include={','.join(packages)}",
         "--dpkgopt=path-exclude=/usr/share/doc/*",
         "--dpkgopt=path-exclude=/usr/share/locale/*",
-        *expired, suite, str(path), *([mirror] if mirror else []),
+        *expired, *options, suite, str(path), *([mirror] if mirror else []),
     ]  # fmt: skip
 
 
