@@ -160,10 +160,15 @@ TYPES: dict[str, Any] = {
 }
 
 
+_VERB = Live(lambda *_: SHOWN)
+
+
 class CompletingGroup(VerbGroup):
     """The verbs of doractl, with completion for their parameters."""
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name == "help":  # no verb of the table: `doractl help VERB` is VERB --help
+            return click.Command("help", params=[click.Argument(["verb"], type=_VERB)])
         command = super().get_command(ctx, cmd_name)
         return command and _completing(command)
 

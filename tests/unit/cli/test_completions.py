@@ -58,6 +58,7 @@ def test_verbs(complete: Complete) -> None:
         *("plain", "start", VERBS["start"].summary),
         *("plain", "stop", VERBS["stop"].summary),
     ]
+    assert complete("doractl help sto") == ["plain,stop"]
     assert complete("doractl node ") == ["plain,restart", "plain,stop"]
 
 
