@@ -266,6 +266,10 @@ def _forget(manager: Manager, boot: BootUnit) -> None:
 
 
 def _in_use(manager: Manager, cell: Cell) -> DoraSystemdError:
+    if cell.state.active == "deactivating":
+        message = f"cannot start {cell.name}: dataflow {cell.uuid} of that name is stopping"
+        hint = f"doractl stop {cell.name} waits for its end, or choose another --name"
+        return DoraSystemdError(message, hint, ExitCode.NAME_IN_USE)
     since = manager.read(cell.unit, ["InactiveExitTimestamp"])["InactiveExitTimestamp"]
     does = "waits for its start" if cell.state.is_held else f"runs since {local_time(since)}"
     return DoraSystemdError(

@@ -76,7 +76,15 @@ def test_old_links_go_when_the_new_file_is_there(
     assert not link.exists()
 
 
-@pytest.mark.parametrize("state", ["active", "activating", "deactivating", "reloading"])
+def test_a_name_of_one_that_is_stopping(manager: FakeManager, scope: Scope) -> None:
+    manager.add(options(), active="deactivating")
+    with pytest.raises(DoraSystemdError, match=f"{UUID} of that name is stopping") as caught:
+        require_free_name(manager, scope, UNIT)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    assert caught.value.hint.startswith("doractl stop robot waits for its end")
+
+
+@pytest.mark.parametrize("state", ["active", "activating", "reloading"])
 def test_a_name_in_use(state: str, manager: FakeManager, scope: Scope) -> None:
     manager.add(options(), active=state, InactiveExitTimestamp=1_700_000_000_000_000)
     with pytest.raises(DoraSystemdError) as caught:
