@@ -14,7 +14,7 @@ import pytest
 from dora_systemd.decisions.recorder.mcap import write_recording
 from dora_systemd.decisions.recorder.reading import Reading, Recorded
 from dora_systemd.trust.rings import find_ring
-from tests.lab.pace import bound
+from tests.lab.pace import bound, pace
 from tests.system.cells import Cell, Project, wait_for
 from tests.unit.fakes.recorder.mcap import File
 
@@ -167,7 +167,7 @@ def freeze(cell: Cell) -> None:
 @pytest.mark.warns(LARGE, "killed on drop")
 def test_one_that_ends_too_late_is_no_failure(cell: Cell, project: Project) -> None:
     path = flow(project, {"memory": "8M", "outputs": ["camera/image"]})
-    start(cell, path, "--grace-duration", "1s")
+    start(cell, path, "--grace-duration", f"{round(2 * max(pace(), 1))}s")
     wait_for("it records", partial(has_more, 5))
     freeze(cell)
     cell.doractl("set", cell.name, "--record", "off")
