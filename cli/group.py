@@ -246,12 +246,13 @@ def _meant_verb(name: str, verbs: Iterable[str], group: str = "") -> str:
 
 
 def _near(error: click.NoSuchOption) -> list[str]:
-    """The options that begin so; or else of those that click suggests the most similar."""
+    """The options that begin as the unknown one does; else similar ones, which click suggests."""
     from difflib import get_close_matches
 
     word, options = error.option_name.lstrip("-"), error.possibilities or ()
-    every = error.ctx.command.params if error.ctx else []
-    longer = [one for param in every for one in param.opts if one.startswith(f"--{word}")]
+    params = error.ctx.command.params if error.ctx else []
+    every = [one for param in params if not getattr(param, "hidden", False) for one in param.opts]
+    longer = [one for one in every if one.startswith(f"--{word}")]
     if len(word) > 1 and longer:
         return longer[:3]
     for least in (0.8, 0.6):

@@ -64,7 +64,7 @@ class LogPipes:
         self.left_out: tuple[bytes, ...] = ()  # lines that contain one of these are left out
         self._muted: frozenset[str] = frozenset()
         self._asked: set[str] = set()  # nodes whose end was requested
-        self._expected: tuple[str, ...] = ()
+        self._expected: tuple[str, ...] = ()  # beginnings of the ids of further ones
         self._lost = 0
 
     def make(self, node_id: str, paths: CellPaths) -> None:

@@ -92,9 +92,9 @@ class ExtraNode:
         cgroup.kill_group(self.group)
 
     def _expect_end(self) -> str:
-        """Leave out how the node ends, and return its id.
+        """Leave out what dora prints about the end of the node, and return the id of the node.
 
-        On a busy machine it may get no CPU time within the grace duration.
+        On a busy machine the node may get no CPU time within the grace duration.
         """
         ident = extra_id(self._name, self.count)
         self._run.pipes.expect_ends(ident)
