@@ -176,7 +176,8 @@ def _crash(crash: Happening) -> Verdict:
 def _end(life: Life, facts: Facts, shutdowns: Sequence[int]) -> Verdict:
     if (failure := life.last("dataflow-failed")) is not None:
         asked = life.last("stop-asked")  # later ones call a restart off
-        if failure.detail("reason") == BY_SIGKILL and asked and asked.at_us <= failure.at_us:
+        is_killed = failure.detail("reason") == BY_SIGKILL
+        if is_killed and asked and asked.at_us <= _killed_us(life, failure):
             by = stopped_by(life, shutdowns)  # with --now
             return _found(Cause.STOPPED, f"stopped by {by}; killed", failure, by=by)
         return _failure(life, failure)
@@ -249,6 +250,12 @@ def _cause_of(life: Life, end: Happening) -> Cause:
     if lost is not None:
         return Cause(lost.name)
     return Cause.NODE_FAILED if final_crashes(life) else Cause.UNIT_FAILED
+
+
+def _killed_us(life: Life, failure: Happening) -> int:
+    """When the runner was killed. systemd records that before it runs what writes `failure`."""
+    exited = life.last("process-exited")
+    return min(failure.at_us, exited.at_us) if exited else failure.at_us
 
 
 def _unit_failure(life: Life, end: Happening) -> Verdict:

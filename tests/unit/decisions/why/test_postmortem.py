@@ -213,6 +213,18 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
          event("stop-asked", life="session", by="root (doractl stop)"), JOB),
         *("Failed", Cause.RUNNER_KILLED, "", "the supervisor process was killed (SIGKILL)"),
     ),
+    "killed, and its restart was called off before the end was recorded": (
+        (*RUNS, unit("process-exited", EXIT_CODE="killed", EXIT_STATUS="9"),
+         event("stop-asked", life="session", by="root (doractl stop)"),
+         failed("runner-killed", "the supervisor process was killed (SIGKILL)"), JOB),
+        *("Failed", Cause.RUNNER_KILLED, "", "the supervisor process was killed (SIGKILL)"),
+    ),
+    "stopped at once, as systemd records it": (
+        (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"),
+         unit("process-exited", EXIT_CODE="killed", EXIT_STATUS="9"),
+         failed("runner-killed", "the supervisor process was killed (SIGKILL)"), JOB),
+        *("Stopped", Cause.STOPPED, "", "stopped by root (doractl stop); killed"),
+    ),
     "crashed during a stop": (
         (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, STOPPED[0],
          failed("runner-killed", "the supervisor process was killed (SIGSEGV)")),
