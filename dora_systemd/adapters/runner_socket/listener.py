@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import json
 import socket
+import sys
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -17,6 +18,9 @@ from dora_systemd.decisions.dora.protocol import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error, words_of
 
 _CHUNK = 1 << 16
+# From Python 3.13 on, asyncio stats the address of a listener to remove the file at the end. Ours
+# is below a descriptor that is closed: the number can have become that of any other file.
+_OPTIONS: dict[str, Any] = {"cleanup_socket": False} if sys.version_info >= (3, 13) else {}
 
 
 class Transport(Protocol):
@@ -127,7 +131,7 @@ async def serve(
 
     listener, kept = door.hand_over() if door else (listen(path), [])
     with listener:
-        server = await asyncio.start_unix_server(talk, sock=listener, limit=limit)
+        server = await asyncio.start_unix_server(talk, sock=listener, limit=limit, **_OPTIONS)
         begun = [await taken_over(*one, limit) for one in kept]
         talks = [asyncio.create_task(talk(*ends)) for ends in begun]
         async with server:

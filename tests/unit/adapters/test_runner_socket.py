@@ -25,6 +25,7 @@ from dora_systemd.adapters.runner_socket.client import (
     refused_reply,
     relay,
 )
+from dora_systemd.adapters.runner_socket.door import Door, Kept
 from dora_systemd.adapters.runner_socket.listener import serve
 from dora_systemd.adapters.runner_socket.relay import open_port
 from dora_systemd.decisions.dora.protocol import Coordinator, parse_coordinator
@@ -172,7 +173,7 @@ def runner(path: Path, coordinator: Coordinator | None) -> Iterator[None]:
         loop.call_soon_threadsafe(task.cancel)
         thread.join(20)
         loop.close()
-        path.unlink(missing_ok=True)  # Python 3.13 does it by itself
+        path.unlink(missing_ok=True)
 
 
 async def end_talks() -> None:
@@ -245,6 +246,36 @@ def test_a_relay_to_nobody(tmp_path: Path) -> None:
                 relay(path)
             assert caught.value.code is ExitCode.NOT_RUNNING
             assert ask(path, {"verb": "yes"}) == {"done": ["yes"]}
+
+
+class LateDoor(Door):
+    """One whose listener is taken over when another file has the number of its directory."""
+
+    def hand_over(self) -> tuple[socket.socket, list[Kept]]:
+        listener, kept = super().hand_over()
+        number = int(listener.getsockname().split("/")[4])
+        other = os.open(os.devnull, os.O_RDONLY)
+        self.taken = os.dup2(other, number)
+        if other != number:
+            os.close(other)
+        return listener, kept
+
+
+def test_another_file_has_the_number_of_the_directory(tmp_path: Path) -> None:
+    path = tmp_path / "runner.sock"
+    door = LateDoor(path, lambda line: (b"", line))
+
+    async def work() -> None:
+        server = asyncio.create_task(serve(path, answer, nowhere, door=door))
+        reply = await asyncio.to_thread(ask, path, {"verb": "yes"})
+        assert reply == {"done": ["yes"]}
+        server.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await server
+
+    asyncio.run(work())
+    os.close(door.taken)
+    assert path.exists()
 
 
 def test_a_port_that_leads_to_the_relay(tmp_path: Path) -> None:
