@@ -8,7 +8,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -169,11 +169,17 @@ def locked(path: Path) -> Iterator[None]:
     os.close(fd)
 
 
-def begin(releases: Releases, project: Project, soak: str) -> "subprocess.Popen[bytes]":
-    """A deploy that goes on."""
+@contextmanager
+def begin(releases: Releases, project: Project, soak: str) -> Iterator["subprocess.Popen[bytes]"]:
+    """A deploy that goes on, unless the context fails: nobody waits for its end then."""
     cell = releases.cell
     command = ("doractl", "--system", "deploy", str(project.root), "--name", cell.name)
-    return subprocess.Popen([*command, "--soak", soak], stderr=subprocess.DEVNULL)
+    with subprocess.Popen([*command, "--soak", soak], stderr=subprocess.DEVNULL) as child:
+        try:
+            yield child
+        except BaseException:
+            child.kill()
+            raise
 
 
 def test_an_interrupted_trial_is_undone(releases: Releases, project: Project) -> None:
@@ -247,7 +253,8 @@ def test_a_first_trial_that_was_killed_can_be_ended(releases: Releases, project:
         wait_for("it runs", lambda: "version first" in cell.messages("a"))
         # Its child first, which would end the trial.
         for pid in run("pgrep", "--parent", str(child.pid)).stdout.split():
-            os.kill(int(pid), signal.SIGKILL)
+            with suppress(ProcessLookupError):  # others have ended by themselves
+                os.kill(int(pid), signal.SIGKILL)
         child.kill()
     assert "trial" in releases.states().values()
     assert "on trial" in cell.doractl("doctor", check=False).stdout
