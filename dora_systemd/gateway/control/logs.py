@@ -8,6 +8,7 @@ the two requests.
 import asyncio
 import time
 from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import suppress
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.journalctl import journal_output
@@ -25,6 +26,7 @@ from dora_systemd.decisions.logs.records import (
     record_text,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control import state
 from dora_systemd.gateway.control.session import Place, Result, Talk, find_if_loaded
 from dora_systemd.gateway.control.state import find_name
 from dora_systemd.names import did_you_mean
@@ -40,6 +42,7 @@ _LINES = ("DORA_STREAM=stdout", "DORA_STREAM=stderr")
 _CUT_NOTE = "earlier lines are skipped here; all lines: doractl logs {name} --node {node}"
 _SETTLE_SECONDS = 0.3
 """Time after the end of a unit for systemd to start it again, if it does."""
+_LAST_LINES_SECONDS = 10.0
 
 
 async def send_logs(talk: Talk, request: Request) -> Result:
@@ -123,7 +126,23 @@ async def subscribe_logs(talk: Talk, request: Request) -> Result:
     since = talk.started.get(uuid, time.time_ns() // 1000)
     follower = Follower(talk, uuid, name, since, request.body.get("level"))
     talk.after_reply(follower.run())
+    talk.followed[uuid] = follower.done
     return {"subscribed": True}
+
+
+async def check(talk: Talk, request: Request) -> Result:
+    """Check. Raises DoraSystemdError (NOT_FOUND).
+
+    A client that follows the dataflow leaves at the reply about its end, so the last lines go
+    first.
+    """
+    reply = await asyncio.to_thread(state.check, talk.scope, request.dataflow)
+    done = talk.followed.get(request.dataflow)
+    if done is not None and "DataflowSpawned" not in reply:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_LAST_LINES_SECONDS):
+                await done.wait()
+    return reply
 
 
 class Follower:
@@ -136,9 +155,16 @@ class Follower:
         self._talk, self._uuid, self._name, self._level = talk, uuid, name, level
         self._since = (since_us, 0)
         self._places = talk.places.get(uuid, {})
+        self.done = asyncio.Event()
 
     async def run(self) -> None:
         """Send everything, then close a connection that has no other purpose."""
+        try:
+            await self._follow()
+        finally:
+            self.done.set()
+
+    async def _follow(self) -> None:
         scope = self._talk.scope
         first = min([self._since, *self._places.values()])[0]
         matches = [*scope_matches(scope, self._name), f"DORA_DATAFLOW={self._uuid}"]

@@ -112,7 +112,7 @@ HANDLERS: dict[str, Handler] = {
     "ConnectedMachines": lambda talk, _: asyncio.to_thread(state.list_daemons, talk.scope),
     "List": lambda talk, _: asyncio.to_thread(state.list_dataflows, talk.scope),
     "GetNodeInfo": lambda talk, _: asyncio.to_thread(state.list_nodes, talk.scope),
-    "Check": lambda talk, request: asyncio.to_thread(state.check, talk.scope, request.dataflow),
+    "Check": logs.check,
     "Info": cell.describe,
     "Start": jobs.start,
     "WaitForSpawn": jobs.wait_for_spawn,

@@ -32,6 +32,8 @@ class Talk:
     started: dict[str, int] = field(default_factory=dict)
     # Up to where the log has been sent, by UUID and node.
     places: dict[str, dict[str, Place]] = field(default_factory=dict)
+    # Set when all lines of a followed dataflow have been sent, by UUID.
+    followed: dict[str, asyncio.Event] = field(default_factory=dict)
     # The connection that delivers a topic, by subscription id.
     topics: dict[str, Connection] = field(default_factory=dict)
     is_over: bool = False  # the client has disconnected

@@ -312,6 +312,26 @@ def test_what_only_looks_does_not_wait_for_a_silent_bus(bench: Bench) -> None:
     assert {*bench.systemd.timeouts} == {"5s"}
 
 
+def test_the_last_lines_come_before_the_reply_about_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    FakeJournal(monkeypatch, tmp_path)
+    bench = Bench(tmp_path, monkeypatch, active="failed")
+    talk = Talk(FakeSocket([]), bench.scope)
+    request = Request("x", "Check", {"dataflow_uuid": UUID})
+
+    async def work() -> None:
+        talk.followed[UUID] = asyncio.Event()
+        reply = asyncio.ensure_future(_answer(talk, request))
+        done, _ = await asyncio.wait({reply}, timeout=2)
+        assert not done
+        talk.followed[UUID].set()
+        await asyncio.wait({reply}, timeout=20)
+        assert reply.done()
+
+    asyncio.run(work())
+
+
 def test_a_dora_restart(bench: Bench) -> None:
     answer = bench.ask("Restart", dataflow_uuid=UUID)
     assert answer == {"DataflowRestarted": {"old_uuid": UUID, "new_uuid": UUID}}
