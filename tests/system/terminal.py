@@ -1,6 +1,7 @@
 """Programs on a terminal of their own, and what they show there."""
 
 import fcntl
+import itertools
 import os
 import re
 import shlex
@@ -14,6 +15,8 @@ from pathlib import Path
 
 from tests.lab.pace import bound
 from tests.system.cells import run, wait_for
+
+_NUMBERS = itertools.count()
 
 
 def shown(*command: str, **environment: str) -> str:
@@ -64,7 +67,9 @@ class Tmux(AbstractContextManager["Tmux"]):
     """A shell in tmux(1), which knows what stays on the screen, as a person sees it."""
 
     def __init__(self, columns: int, rows: int) -> None:
-        self._server = ["tmux", "-L", f"test-{os.getpid()}", "-f", "/dev/null"]
+        # Not the name of an earlier one: that server may just be ending, and takes this one along.
+        name = f"test-{os.getpid()}-{next(_NUMBERS)}"
+        self._server = ["tmux", "-L", name, "-f", "/dev/null"]
         size = ("-x", str(columns), "-y", str(rows))
         shell = "env PS1='% ' HISTFILE= bash --norc --noprofile -i"
         self._tmux("new-session", "-d", *size, shell)
