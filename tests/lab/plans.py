@@ -80,6 +80,8 @@ def plan_test(form: str) -> list[Step]:
     # The unit tests, which all others wait for, leave it a third of a processor.
     build = replace(build_step(), after=())
     inside, several = limits_step(), machines_steps()
+    # What they take beside all others.
+    queue = [replace(one, after=(unit.name,), minutes=21) for one in plan_system("container")]
     several = [replace(one, after=(unit.name,), minutes=12) for one in several]
     inside = replace(inside, after=(unit.name,))
     restarted = replace(reboot_step(), after=(build.name, inside.name))
@@ -87,23 +89,10 @@ def plan_test(form: str) -> list[Step]:
     oldest, newest = platform_step(OLD_SUITE, minutes=2), platform_step(NEW_SUITE, "-k", NEW)
     lane = [packages_step(), wheels_step(), oldest, newest, *plan_lab(form)]
     others = [*plan_other_python(form), *plan_emulator(form)]
-    queue = queue_of(unit, [several, lane, others])
     # The machines have the longest way, nearly all of it waiting, so nothing is before them.
     plan = [unit, *several, build, *in_a_row(lane, build)]
     plan += [inside, restarted, arm, *in_a_row(others, arm), *queue]
     return [replace(one, longest=max(LEAST_LONGEST, PATIENCE * one.minutes)) for one in plan]
-
-
-def queue_of(unit: Step, lanes: Sequence[Sequence[Step]]) -> list[Step]:
-    """The containers with the system tests.
-
-    Each of the lanes leaves its processor time, when it has ended, to one more container.
-    """
-    ends = [tuple(one.name for one in steps) for steps in lanes]
-    # With what they take beside all others.
-    begins = [*[((unit.name,), 20)] * CONTAINERS, *((names, 8) for names in ends)]
-    steps = zip(system_steps(len(begins)), begins, strict=True)
-    return [replace(one, after=after, minutes=minutes) for one, (after, minutes) in steps]
 
 
 def in_a_row(steps: Sequence[Step], first: Step) -> list[Step]:
@@ -226,10 +215,10 @@ def platform_step(suite: str, *options: str, minutes: int = 1) -> Step:
 
 
 def plan_system(form: str) -> list[Step]:
-    if form == "container":
-        return system_steps(CONTAINERS)
     here = " and not lab" if form == "host" else ""
     arguments = ["tests/system", "-m", f"{IN_CONTAINER}{here}"]
+    if form == "container":
+        return queue_steps("system tests", "browser", arguments, minutes=14)
     if form != "host":
         return [lab_step(f"system tests, {form}", form, arguments)]
     if not Path("/run/systemd/system").is_dir():
@@ -238,12 +227,6 @@ def plan_system(form: str) -> list[Step]:
         raise LabError("use LAB=host as root", "its tests run in user scope: be a user, not root")
     command = ["python", "-m", *PYTEST, *arguments]
     return [Step("system tests, this machine", command, partial(in_venv, for_system_tests=True))]
-
-
-def system_steps(count: int) -> list[Step]:
-    """Containers that share the system tests."""
-    arguments = ["tests/system", "-m", IN_CONTAINER]
-    return queue_steps("system tests", "browser", arguments, 14, count)
 
 
 def plan_foreign(_form: str) -> list[Step]:
