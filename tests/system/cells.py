@@ -47,7 +47,7 @@ for event in node:
 # A machine of the lab has little time to spare for how often a test polls and how often a node
 # sends.
 IS_SLOW = os.environ.get("LAB") in ("vm", "emulator")
-TICK = f"dora/timer/millis/{250 if IS_SLOW else 100}"
+TICK = f"dora/timer/millis/{250 if IS_SLOW else 50}"
 POLL_SECONDS = 0.5 if IS_SLOW else 0.02
 LONGEST_POLL_SECONDS = 1.0 if IS_SLOW else 0.2
 THREE_NODES = f"""
