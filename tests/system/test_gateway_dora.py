@@ -246,9 +246,12 @@ def test_stop_and_restart(dora: Dora, three: list[Cell]) -> None:
     )
 
 
-def test_logs(dora: Dora, three: list[Cell]) -> None:
+@pytest.mark.usefixtures("three")
+def test_logs(dora: Dora) -> None:
     known = uuids(dora)
-    wait_for("lines", lambda: len(three[1].messages("source")) > 20)
+    # Not those of an earlier dataflow of that name.
+    words = ("logs", known["two"], "--node", "source")
+    wait_for("lines", lambda: dora(*words).stdout.count("\n") > 20)
     lines = dora("logs", "two", "--node", "source").stdout.splitlines()
     assert [line.split(" ", 2)[2] for line in lines[:3]] == [f"source: sent {n}" for n in range(3)]
     assert len(dora("logs", "two", "--tail", "5").stdout.splitlines()) == 5
