@@ -246,9 +246,8 @@ def test_stop_and_restart(dora: Dora, three: list[Cell]) -> None:
     )
 
 
-@pytest.mark.usefixtures("three")
-def test_logs(dora: Dora) -> None:
-    known = uuids(dora)
+def test_logs(dora: Dora, three: list[Cell]) -> None:
+    known = {one.name: one.status.uuid for one in three}
     # Not those of an earlier dataflow of that name.
     words = ("logs", known["two"], "--node", "source")
     wait_for("lines", lambda: dora(*words).stdout.count("\n") > 20)
