@@ -247,9 +247,9 @@ def test_stop_and_restart(dora: Dora, three: list[Cell]) -> None:
 
 
 def test_logs(dora: Dora, three: list[Cell]) -> None:
-    known = {one.name: one.status.uuid for one in three}
+    known = uuids(dora)
     # Not those of an earlier dataflow of that name.
-    words = ("logs", known["two"], "--node", "source")
+    words = ("logs", three[1].status.uuid, "--node", "source")
     wait_for("lines", lambda: dora(*words).stdout.count("\n") > 20)
     lines = dora("logs", "two", "--node", "source").stdout.splitlines()
     assert [line.split(" ", 2)[2] for line in lines[:3]] == [f"source: sent {n}" for n in range(3)]

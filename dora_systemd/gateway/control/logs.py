@@ -28,7 +28,6 @@ from dora_systemd.decisions.logs.records import (
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control import state
 from dora_systemd.gateway.control.session import Place, Result, Talk, find_if_loaded
-from dora_systemd.gateway.control.state import find_name
 from dora_systemd.names import did_you_mean
 from dora_systemd.scope import Scope
 from dora_systemd.values import quoted
@@ -63,7 +62,7 @@ async def _yielding(parts: Iterator[str]) -> AsyncIterator[str]:
 def _read_logs(scope: Scope, request: Request, node: str) -> tuple[str, list[bytes], Place]:
     now = time.time_ns() // 1000
     uuid = _uuid_of(scope, request)
-    name = find_name(scope, uuid)
+    name = state.find_name(scope, uuid)
     matches = [*scope_matches(scope, name), f"DORA_DATAFLOW={uuid}", f"DORA_NODE={node}", *_LINES]
     tail = [] if request.tail is None else [f"--lines={request.tail}"]
     lines: list[bytes] = []
@@ -122,7 +121,7 @@ async def subscribe_logs(talk: Talk, request: Request) -> Result:
     For a dataflow that this connection has started: from its start on.
     """
     uuid = request.dataflow
-    name = await asyncio.to_thread(find_name, talk.scope, uuid)
+    name = await asyncio.to_thread(state.find_name, talk.scope, uuid)
     since = talk.started.get(uuid, time.time_ns() // 1000)
     follower = Follower(talk, uuid, name, since, request.body.get("level"))
     talk.after_reply(follower.run())
