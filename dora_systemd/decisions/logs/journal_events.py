@@ -205,11 +205,12 @@ def event_fields(name: str, **details: Value) -> dict[str, Value]:
     """The journal fields of event `name`; the caller adds those of the origin.
 
     Each detail becomes DORA_<DETAIL>, except `dataflow` and `node`, which only complete the text.
-    The text ends with `exit` (such as "exit code 1") and `reason`. Raises KeyError for an unknown
-    event.
+    `removed` names a node that has no origin any more, for the text and DORA_NODE. The text ends
+    with `exit` (such as "exit code 1") and `reason`. Raises KeyError for an unknown event.
     """
     kind = EVENTS[name]
-    text = kind.text.format_map(_Unnamed(details))
+    removed = details.pop("removed", "")
+    text = kind.text.format_map(_Unnamed({**details, "node": removed} if removed else details))
     ending = [str(details[key]) for key in ("exit", "reason") if details.get(key)]
     fields: dict[str, Value] = {
         "MESSAGE": ": ".join([text, *ending]),
@@ -220,4 +221,4 @@ def event_fields(name: str, **details: Value) -> dict[str, Value]:
     own = {
         legal_name(key, "DORA_"): value for key, value in details.items() if key not in _TEXT_ONLY
     }
-    return {**own, **fields}
+    return {**own, **fields, **({"DORA_NODE": removed} if removed else {})}

@@ -155,7 +155,7 @@ class Applier:
             how=step.how.value,
             reason=words,
             file=step.file,
-            **({} if node else {"dora_node": step.node}),
+            **({} if node else {"removed": step.node}),
         )
 
     def _relative(self, path: str) -> str:

@@ -68,6 +68,13 @@ def test_a_detail_may_be_missing(name: str) -> None:
     assert event_fields(name)["DORA_EVENT"] == name
 
 
+def test_the_text_names_a_node_that_was_removed() -> None:
+    details = {"how": "removed", "reason": "flow.yml", "removed": "plot"}
+    fields = event_fields("node-reloaded", dataflow="robot", node="", **details)
+    assert fields["MESSAGE"] == "Node plot was removed: flow.yml"
+    assert fields["DORA_NODE"] == "plot"
+
+
 def test_details_cannot_replace_the_event() -> None:
     fields = event_fields("reloaded", dataflow="r", event="other", reason="2 files changed")
     assert fields["DORA_EVENT"] == "reloaded"
