@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -293,8 +292,10 @@ def interrupts_for_pager() -> Iterator[None]:
 
 def print_paged(chunks: Iterator[bytes]) -> None:
     """Print to the pager that journalctl(1) would use, with the same options."""
+    from shutil import which
+
     pager, environment = pager_of(os.environ)
-    if not shutil.which(pager.split()[0]) or pager == "cat" or is_dumb():
+    if not which(pager.split()[0]) or pager == "cat" or is_dumb():
         _write(chunks, sys.stdout.fileno())
         return
     check_program(pager.split()[0])

@@ -6,12 +6,10 @@ is written part by part, within a number of bytes.
 
 import errno
 import fcntl
-import hashlib
 import json
 import os
 import re
 import stat
-import tarfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -61,6 +59,8 @@ class _Bounded:
     """Counts what a section writes, and its digest."""
 
     def __init__(self, file: BinaryIO, most: int) -> None:
+        import hashlib
+
         self._file, self._most = file, most
         self.size, self.digest = 0, hashlib.sha256()
 
@@ -133,6 +133,8 @@ class Archive:
         self._file.truncate()
 
     def _header(self, name: str, size: int) -> bytes:
+        import tarfile
+
         info = tarfile.TarInfo(name)
         info.size, info.mode, info.mtime = size, 0o600, self._at_us // 1_000_000
         return info.tobuf(tarfile.USTAR_FORMAT)

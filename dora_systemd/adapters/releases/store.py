@@ -7,7 +7,6 @@ name with a dot in front, and the next deploy removes it.
 
 import contextlib
 import fcntl
-import hashlib
 import os
 import subprocess
 from collections.abc import Iterable, Iterator
@@ -295,6 +294,8 @@ def remove_tree(path: Path) -> None:
 
 def stored_at(path: Path) -> Stored | None:
     """A file of a release, as a manifest describes it; None if there is none to read."""
+    import hashlib
+
     try:
         if path.is_symlink():
             return Stored(target=str(path.readlink()))

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import HISTORY, Store, is_locked, store_root
-from dora_systemd.adapters.releases.transfer import leftovers
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import (
     UNKNOWN,
@@ -104,6 +103,8 @@ def _row(store: Store, standing: Standing | None, one: Known, past: Sequence[Swi
 
 def judge_releases(manager: Manager, scope: Scope) -> Iterator[Finding]:
     """The findings of `doractl doctor` about what a killed deploy has left."""
+    from dora_systemd.adapters.releases.transfer import leftovers
+
     for path in leftovers(root_of(scope)):
         text = f"{path} is the rest of a deploy -H that was killed"
         yield Finding("releases", State.NOTE, text, "the next one removes it")

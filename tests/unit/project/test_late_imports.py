@@ -28,12 +28,18 @@ LATE = {
     "most notices come without a bundle, which needs all that doctor checks": {
         "verbs.notice.send": {"verbs.bundles.recording", "verbs.bundles.write"},
     },
+    "OpenSSL, and every compressor: whoever only counts bundles writes none": {
+        "adapters.bundles.store": {"hashlib", "tarfile"},
+    },
+    "OpenSSL, and every compressor: whoever lists releases compares and receives none": {
+        "adapters.releases.store": {"concurrent.futures", "hashlib"},
+        "verbs.releases.listing": {"adapters.releases.transfer"},
+    },
     "a report of what this machine knows reads no bundle": {
         "cli.verbs.look.why": {"verbs.bundles.listing"},
     },
     "it imports logging, and most commands run nothing in a thread": {
         "adapters.host.process": {"concurrent.futures"},
-        "adapters.releases.store": {"concurrent.futures"},
     },
     "it has all properties, and verbs that read processes judge no systemd": {
         "decisions.views.diagnosis": {"decisions.unit.systemd_versions"},
@@ -107,7 +113,7 @@ LATE = {
     },
     "YAML, and every compressor: most who read a file need neither": {
         "adapters.host.files": {"yaml", "adapters.host.yaml_loader"},
-        "cli.verbs.look.logs": {"verbs.follow", "cli.remote.machines"},
+        "cli.verbs.look.logs": {"verbs.follow", "cli.remote.machines", "shutil"},
     },
     "uv only": {"decisions.cell.uv": {"tomllib"}},
     "JSON is for programs, and most who do something are people": {
