@@ -190,6 +190,16 @@ def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
     return {**policy.dora_keys(), **{key: kept[key] for key in _BUDGET if key in kept}}
 
 
+def idle_budgets(dataflow: Dataflow, options: RunnerOptions) -> Iterator[str]:
+    """A warning for each node with settings about restarts that dora never restarts."""
+    for node in dataflow.nodes:
+        given = [key for owner, key, _ in options.settings if owner == node.id]
+        bounds = next((key for key in given if key in POLICY_KEYS[1:]), "")
+        policy = _restart_keys(node, options).get("restart_policy", node.restart_policy)
+        if bounds and policy in ("", "never"):
+            yield f"{bounds} of the node {node.id} has no effect: its restart_policy is no"
+
+
 def _with_budget(
     bounds: Mapping[str, Any], own: RestartPolicy, given: Container[str]
 ) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.dora.preparation import check_named_nodes
 from dora_systemd.adapters.host.files import absolute_path, decoded, parse_yaml
-from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
+from dora_systemd.decisions.cell.launch import LaunchPlan, idle_budgets, launch_descriptor
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.uv import LOCK, find_lock, uv_project
 from dora_systemd.decisions.descriptor.dataflow import (
@@ -79,7 +79,8 @@ def plan_notes(scope: Scope, look: Look, dataflow: Dataflow, launch: LaunchPlan)
 
 
 def start_warnings(where: Where, dataflow: Dataflow, sight: Sight) -> Iterator[str]:
-    """Warn of what keeps Python nodes from working. Raises DoraSystemdError for what must."""
+    """Warn of what keeps nodes from working. Raises DoraSystemdError for what must."""
+    yield from idle_budgets(dataflow, where.options)
     yield from unbuilt_warnings(where.options, sight)
     if any(node.kind in (NodeKind.PYTHON, NodeKind.OPERATOR) for node in dataflow.nodes):
         venv = _nodes_venv(where.options, sight)

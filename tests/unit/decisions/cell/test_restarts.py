@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.decisions.cell.launch import launch_descriptor
+from dora_systemd.decisions.cell.launch import idle_budgets, launch_descriptor
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import policies_of
 from dora_systemd.decisions.cell.restarts import (
@@ -73,6 +73,29 @@ def test_a_budget_without_a_policy(node: dict[str, object], policy: str) -> None
 def test_a_budget_of_what_a_node_owes_has_an_effect() -> None:
     document = {"max_restarts": 3, "nodes": {"camera": {"owes": OWES}}}
     assert not list(idle_warnings(settings({}, document)))
+
+
+@pytest.mark.parametrize(
+    ("own", "descriptor", "flags", "is_idle"),
+    [
+        ({"max_restarts": 2}, "", {}, True),
+        ({"restart_delay": "1s"}, "never", {}, True),
+        ({"max_restarts": 2, "restart_policy": "no"}, "always", {}, True),
+        ({"max_restarts": 2}, "on-failure", {}, False),
+        ({"max_restarts": 2}, "", {"restart_policy": "always"}, False),
+        ({"max_restarts": 2, "owes": OWES}, "", {}, False),
+        ({"nice": 3}, "", {}, False),
+    ],
+)
+def test_a_budget_of_a_node_that_dora_never_restarts(
+    own: dict[str, object], descriptor: str, flags: dict[str, object], is_idle: bool
+) -> None:
+    policy = {"restart_policy": descriptor} if descriptor else {}
+    node = {"id": "camera", "path": "camera.py", "outputs": ["image"], **policy}
+    dataflow = parse_dataflow({"nodes": [node]}, "/srv/robot/dataflow.yml")
+    given = runner(settings(flags, {"nodes": {"camera": own}}))
+    expected = f"{next(iter(own))} of the node camera has no effect: its restart_policy is no"
+    assert list(idle_budgets(dataflow, given)) == ([expected] if is_idle else [])
 
 
 def test_default_restarts_nothing() -> None:
