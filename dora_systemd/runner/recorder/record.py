@@ -92,12 +92,23 @@ class Drops:
                 self._counts[int(one)] = self._counts.get(int(one), 0) + 1
 
 
-def give_way() -> None:
-    """Take the CPU time that nobody needs, and be killed first when memory is short."""
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+def be_killed_first() -> None:
+    """Be killed before others when memory is short."""
     with suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:  # noqa: PTH123
         file.write(KILLED_FIRST)
+
+
+def give_way() -> None:
+    """Take the CPU time that nobody needs, with all threads; later ones inherit it.
+
+    Not before the imports: where all CPU time is used, these would take minutes.
+    """
+    done: set[str] = set()
+    while new := {*os.listdir("/proc/self/task")} - done:  # noqa: PTH208 - without pathlib
+        for thread in new:
+            with suppress(OSError):
+                os.sched_setscheduler(int(thread), os.SCHED_IDLE, os.sched_param(0))
+        done |= new
 
 
 def receive_ring(path: str) -> int:
@@ -177,7 +188,7 @@ def record(node: Any, recorder: Recorder) -> None:
 
 def main(path: str, package: str) -> None:
     """Open the ring, and run as a node."""
-    give_way()
+    be_killed_first()
     writer, drops = import_writer(package), Drops()
     fd = receive_ring(path)
     header = writer.parse_header(os.pread(fd, writer.ALIGN, 0))
@@ -185,7 +196,9 @@ def main(path: str, package: str) -> None:
     import pyarrow
     from dora import Node
 
-    record(Node(), Recorder(writer, ring, pyarrow, drops))
+    node = Node()
+    give_way()
+    record(node, Recorder(writer, ring, pyarrow, drops))
 
 
 if __name__ == "__main__":

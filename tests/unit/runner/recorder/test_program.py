@@ -1,6 +1,7 @@
 """runner/recorder/record.py: the real program, with a dora and a pyarrow of the test."""
 
 import asyncio
+import json
 import os
 import subprocess
 import sys
@@ -15,14 +16,23 @@ from dora_systemd.runner.recorder.keep import RingSocket, fitted_ring, header_of
 PACKAGE = Path(dora_systemd.__file__).parent
 SCRIPT = PACKAGE / "runner" / "recorder" / "record.py"
 DORA = """
-import datetime, os
+import datetime, os, threading
 
+def policies():
+    return [os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")]
+
+BEFORE = policies()
 SENT = datetime.datetime(2026, 11, 27, tzinfo=datetime.timezone.utc)
 EVENTS = [{events}]
 
 class Node:
+    def __init__(self):
+        threading.Thread(target=threading.Event().wait, daemon=True).start()
+
     def next(self):
         event = EVENTS.pop(0)
+        if callable(event):
+            return event()
         if isinstance(event, bytes):
             os.write(1, event)
             return {{"type": "NODE_RESTARTED"}}
@@ -124,6 +134,13 @@ def test_what_dora_drops_is_counted(tmp_path: Path) -> None:
     events = (repr(line % 1), repr(line % 1 + line % 0), repr(b"Discarding event"), event(1, b"x"))
     _, reading = recorded(tmp_path, *events, STOP)
     assert [one.dropped for one in reading.states] == [0, 2]
+
+
+def test_all_threads_give_way_once_it_is_connected(tmp_path: Path) -> None:
+    metadata = '{"before": BEFORE, "now": policies()}'
+    (message,), _ = recorded(tmp_path, f"lambda: {event(0, b'x', metadata=metadata)}", STOP)
+    usual, idle = os.sched_getscheduler(0), os.SCHED_IDLE
+    assert json.loads(message.meta) == {"before": [usual], "now": [idle, idle]}
 
 
 def test_it_ends_with_an_input(tmp_path: Path) -> None:
