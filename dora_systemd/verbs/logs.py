@@ -1,6 +1,7 @@
 """`doractl logs` and `doractl run`: read the records of a dataflow from the journal."""
 
 import contextlib
+import errno
 import math
 import os
 import select
@@ -67,12 +68,22 @@ def pass_logs(query: LogQuery, fd: int, on_left_out: Callable[[], object] | None
     """
     with open_journalctl(query_arguments(_oldest_first(query))) as child:
         assert child.stdout
-        while data := os.read(child.stdout.fileno(), CHUNK):
+        while data := _read_for(fd, child.stdout.fileno()):
             write_whole(data, fd)
             if on_left_out is not None and _LEFT_OUT in data:
                 on_left_out()
                 on_left_out = None
         return end_journalctl(child)
+
+
+def _read_for(fd: int, source: int) -> bytes:
+    """Wait for the next bytes of `source`. Raises BrokenPipeError if nobody reads `fd` any more."""
+    poll = select.poll()
+    poll.register(source, select.POLLIN)
+    poll.register(fd, 0)  # poll(2) reports the end of a reader in any case
+    if fd in dict(poll.poll()):
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+    return os.read(source, CHUNK)
 
 
 def write_whole(data: bytes, fd: int) -> None:

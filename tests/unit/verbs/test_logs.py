@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -257,6 +258,26 @@ def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     fake_journalctl(monkeypatch, tmp_path, b"a line\n")
     with Path("/dev/full").open("wb") as full, pytest.raises(OSError, match="No space left"):
         pass_logs(QUERY, full.fileno())
+
+
+def test_a_followed_log_ends_with_its_reader(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As journalctl does: else `logs --follow | head -1` would wait for another line."""
+    make_program(tmp_path / "journalctl", "#!/bin/sh\necho a line\nexec sleep 60\n")
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    reader, writer = os.pipe()
+
+    def read_one() -> None:
+        os.read(reader, 100)
+        os.close(reader)
+
+    reading = Thread(target=read_one)
+    reading.start()
+    with pytest.raises(BrokenPipeError):
+        pass_logs(replace(QUERY, is_follow=True), writer)
+    reading.join()
+    os.close(writer)
 
 
 def test_nothing_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
