@@ -166,7 +166,7 @@ class NodeRequests:
             raise unknown_request(request)
         run = self._reloader.run
         if run is None:
-            raise _not_running("no node runs")
+            raise _not_running(f"cannot {what} {node}", "no node runs")
         async with run.lock:
             target = self._target(run, node, grace)
             do = self._restart if what == RESTART else self._stop
@@ -202,7 +202,7 @@ class NodeRequests:
     async def _restart(self, run: Run, target: Target, by: str) -> str:
         node, old, cell = target.node, target.status, run.pump.cell
         if old.state != "waiting":
-            _require_running(cell)
+            _require_running(cell, f"cannot restart {node}")
             if (_has_ended(old) and not is_stopped(old)) or (is_stopped(old) and old.machine):
                 raise _gone(node, old)
         (new,) = initial_nodes({node: old.kind}, {"nodes": [target.definition]}, now_us()).values()
@@ -224,7 +224,7 @@ class NodeRequests:
         if _has_ended(old):
             return f"Node not running: {node} ({_how(old)})"
         if old.state != "waiting":
-            _require_running(cell)
+            _require_running(cell, f"cannot stop {node}")
         await self._tell(run, target, life.NodeAsked(now_us(), node, STOP, by))
         try:
             await self._hand_of(run).stop(target)
@@ -262,15 +262,16 @@ def _gone(node: str, old: NodeStatus) -> DoraSystemdError:
     return DoraSystemdError(message, hint, ExitCode.NOT_RUNNING)
 
 
-def _require_running(cell: Cell) -> None:
+def _require_running(cell: Cell, problem: str) -> None:
     if cell.state is not State.RUNNING:
         is_late = cell.state in (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
-        raise _not_running("it is stopping" if is_late else "not all nodes are ready yet")
+        why = "the dataflow is stopping" if is_late else "not all nodes are ready yet"
+        raise _not_running(problem, why)
 
 
-def _not_running(why: str) -> DoraSystemdError:
+def _not_running(problem: str, why: str) -> DoraSystemdError:
     hint = "doractl list NAME says what it does"
-    return DoraSystemdError(f"cannot restart or stop a node: {why}", hint, ExitCode.NOT_RUNNING)
+    return DoraSystemdError(f"{problem}: {why}", hint, ExitCode.NOT_RUNNING)
 
 
 class Recheck:
