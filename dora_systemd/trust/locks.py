@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
 from dora_systemd.trust.eyes import check_regular
 from dora_systemd.trust.files import unreadable
@@ -33,8 +33,8 @@ class LockPlace(NamedTuple):
 def find_lock(directory: Path) -> LockPlace | None:
     """The lock file in a RuntimeDirectory; None if there is none.
 
-    Raises DoraSystemdError (BAD_INPUT) for anything but a regular file of the directory's owner, or
-    if the caller may not look.
+    Raises DoraSystemdError: BAD_INPUT for anything but a regular file of the directory's owner,
+    NO_PERMISSION if the caller may not look.
     """
     return _at_lock(directory, place_of)
 
@@ -99,6 +99,10 @@ def _at_lock(directory: Path, use: Callable[[int], T]) -> T | None:
                 os.close(found)
     except (FileNotFoundError, NotADirectoryError):
         return None
+    except PermissionError as error:
+        message = f"cannot use {path}: permission denied"
+        hint = "use sudo: only root and the user it runs as may"
+        raise DoraSystemdError(message, hint, ExitCode.NO_PERMISSION) from error
     except OSError as error:
         raise unreadable(path, error) from error
 

@@ -1,5 +1,6 @@
 """The lock file of a dataflow, in a directory that belongs to its nodes' user."""
 
+import errno
 import fcntl
 import os
 from collections.abc import Callable, Iterator
@@ -34,6 +35,24 @@ def test_there_is_none(tmp_path: Path) -> None:
     for directory in (tmp_path, tmp_path / "missing"):
         assert find_lock(directory) is None
         assert open_lock(directory) is None
+
+
+def test_the_caller_may_not_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `doractl inhibit --system` without root: what others see of it stays as it is."""
+    (tmp_path / NAME).touch()
+    opened = os.open
+
+    def refused(path: str, *how: int, **more: int) -> int:
+        if path == NAME:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return opened(path, *how, **more)
+
+    monkeypatch.setattr(os, "open", refused)
+    with pytest.raises(DoraSystemdError) as caught:
+        open_lock(tmp_path)
+    assert caught.value.message == f"cannot use {tmp_path / NAME}: permission denied"
+    assert caught.value.hint.startswith("use sudo")
+    assert caught.value.code is ExitCode.NO_PERMISSION
 
 
 def test_which_file_it_is(tmp_path: Path, lock: int) -> None:
