@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import place_hint
 from dora_systemd.trust.files import check_size, read_own_file
 from dora_systemd.trust.paths import refusal
 from dora_systemd.values import shown
@@ -21,8 +22,6 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 """Errors of writing where the caller may not write."""
 _WRITE_HINTS = {
-    **dict.fromkeys((errno.EACCES, errno.EPERM), "use sudo, or choose a place that is yours"),
-    errno.EROFS: "the file system is mounted read-only",
     errno.ENOSPC: "the disk is full, see df",
     errno.EDQUOT: "the quota is used up, see quota",
 }
@@ -129,9 +128,11 @@ def write_atomic(
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
-        code = ExitCode.NO_PERMISSION if error.errno in REFUSED else ExitCode.FAILURE
+        is_refused = error.errno in REFUSED
+        code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+        hint = place_hint(path, error) if is_refused else _WRITE_HINTS.get(error.errno or 0, "")
         message = f"cannot write {shown(str(path))}: {error.strerror}"
-        raise DoraSystemdError(message, _WRITE_HINTS.get(error.errno or 0, ""), code) from error
+        raise DoraSystemdError(message, hint, code) from error
 
 
 def _check_shape(text: str, path: Path) -> None:

@@ -1,5 +1,6 @@
 """Files of every kind that a path can name; YAML as dora reads it; atomic writes."""
 
+import errno
 import os
 import signal
 import stat
@@ -215,3 +216,16 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(DoraSystemdError, match=r"^cannot write .*/no/x: "):
         write_atomic(tmp_path / "no" / "x", "text")
     assert [one.name for one in tmp_path.iterdir()] == ["x"]
+
+
+def test_a_refused_write_says_what_is_possible(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All these files have a fixed place, so no hint recommends another one."""
+
+    def refused(*_: object) -> int:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    with monkeypatch.context() as patch, pytest.raises(DoraSystemdError) as caught:
+        patch.setattr(os, "open", refused)
+        write_atomic(Path("/etc/systemd/system/dora-robot.service"), "text")
+    assert caught.value.hint == "use sudo, or --user for a dataflow of your own"
+    assert caught.value.code is ExitCode.NO_PERMISSION
