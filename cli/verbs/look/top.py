@@ -3,10 +3,12 @@
 import re
 import sys
 import time
+from functools import partial
 
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, parsed_by, scope_options
 from dora_systemd.cli.screen import FIRST_SECONDS, show_live
 from dora_systemd.cli.terminal import is_dumb
@@ -71,7 +73,7 @@ def command(
             _print_objects(top, interval, sort, is_once)
         elif is_once or not is_terminal:
             time.sleep(FIRST_SECONDS)
-            print(format_top(top.look(), sort))
+            print_table(partial(format_top, top.look(), sort))
         else:
             show_live(scope, top, interval, sort)
     except KeyboardInterrupt:

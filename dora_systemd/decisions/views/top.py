@@ -77,10 +77,10 @@ def top_rows(look: Look, by: str, is_reversed: bool = False) -> list[TopRow]:
     return [row for one in entries for row in _rows(one, look, by, is_reversed)]
 
 
-def format_top(look: Look, by: str) -> str:
-    """The whole table, for a pipe."""
-    rows = top_rows(look, by)
-    return format_table(HEADER, [row.cells for row in rows]) if rows else NOTHING
+def format_top(look: Look, by: str, width: int | None = None, want_colors: bool = False) -> str:
+    """The whole table, for a pipe, or for a terminal of that width."""
+    cells = [row.cells for row in top_rows(look, by)]
+    return format_table(HEADER, cells, width, want_colors) if cells else NOTHING
 
 
 def _rows(entry: TopEntry, look: Look, by: str, is_reversed: bool) -> list[TopRow]:

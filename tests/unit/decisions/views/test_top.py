@@ -88,6 +88,20 @@ def test_table_by_cpu() -> None:
 
 
 @pytest.mark.parametrize(
+    ("width", "titles"),
+    [
+        (80, "NAME STATE CPU% MEM WAITS FOR"),
+        (60, "NAME STATE CPU% MEM"),
+        (40, "NAME STATE"),
+    ],
+)
+def test_a_narrow_terminal_has_fewer_columns(width: int, titles: str) -> None:
+    lines = format_top(LOOK, "cpu", width).splitlines()
+    assert " ".join(lines[0].split()) == titles
+    assert max(map(len, lines)) <= width
+
+
+@pytest.mark.parametrize(
     ("sort", "names"),
     [
         ("cpu", ["robot", "detector", "camera", "plot", "arm"]),
