@@ -31,6 +31,7 @@ from dora_systemd.verbs.machines.register import (
 )
 
 _HEADER = ("NAME", "HOST", "KEY")
+_NONE = "No machine is declared."
 
 
 @click.group("machine", cls=SubverbGroup, no_args_is_help=False)
@@ -76,7 +77,7 @@ def show(output: str) -> None:
     if output == "json":
         print_json([_object(one) for one in known])
     elif not known:
-        click.echo("No machine is declared.")
+        click.echo(_NONE)
     else:
         rows = [(one.name, one.host.text, one.key or "yours") for one in known]
         print_table(lambda width, colors: format_table(_HEADER, rows, width, colors))
@@ -106,6 +107,8 @@ def check(names: tuple[str, ...], output: str) -> int:
             _print_check(one, found, wrong)
     if output == "json":
         print_json(objects)
+    elif not known:
+        click.echo(_NONE)
     return worst
 
 

@@ -136,6 +136,15 @@ def test_help_of_all_options_everywhere(capsys: pytest.CaptureFixture[str]) -> N
         assert main.run([*verb, "--help=all"]) == 0
         assert capsys.readouterr().out == shown
     # Behind -- it is a word of somebody else's.
+def test_no_machine_to_check(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No output at all would look as if all of them were in order."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    assert main.run(["--user", "machine", "check"]) == 0
+    assert capsys.readouterr().out == "No machine is declared.\n"
+
+
     assert main.run(["inhibit", "robot", "--help", "--", "true", "--help=all"]) == 0
 
 
