@@ -64,7 +64,9 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
     want_build: what it needs is built in the release. Raises DoraSystemdError.
     """
     path = project_file(request)
-    wanted = request._replace(dataflow=str(path), is_unbuilt=want_build)
+    # Unchanged without an argument: then the error for a missing file has another hint.
+    given = request if path_of(request) == path else request._replace(dataflow=str(path))
+    wanted = given._replace(is_unbuilt=want_build)
     files = read_files(wanted)
     plan, dataflow = make_plan(scope, wanted, files), files.dataflow()
     directory = plan.options.working_directory

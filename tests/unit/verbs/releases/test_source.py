@@ -22,6 +22,15 @@ def source_of(root: Path) -> Source:
     return find_source(USER, StartRequest(str(root), flags={"dora": dora}))
 
 
+def test_no_project_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever has named no file cannot correct its path."""
+    monkeypatch.chdir(tmp_path)
+    for given, hint in (("dataflow.yml", "go to the directory"), (str(tmp_path), "correct the")):
+        with pytest.raises(DoraSystemdError, match=f"{tmp_path}/dataflow.yml: there is") as caught:
+            find_source(USER, StartRequest(given))
+        assert caught.value.hint.startswith(hint)
+
+
 @pytest.mark.parametrize("name", [FLOW, SETTINGS, VARIABLES])
 @pytest.mark.parametrize("lie", ["A=2\n", None])
 def test_a_copy_says_the_same(tmp_path: Path, name: str, lie: str | None) -> None:
