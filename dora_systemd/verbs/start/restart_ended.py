@@ -20,7 +20,7 @@ from dora_systemd.trust.paths import exists, is_directory
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
-from dora_systemd.verbs.start.request import current_directory
+from dora_systemd.verbs.start.request import DEFAULT_FILE, current_directory
 
 if TYPE_CHECKING:
     from dora_systemd.verbs.start.plan import Plan
@@ -137,7 +137,7 @@ def find_start(
         if error.code is ExitCode.NOT_FOUND and (found := _readable(scope, selector)):
             _refuse_released(scope, found)
             return found
-        raise _without_start(scope, selector) or error from error
+        raise _without_start(scope, selector) or _with_file(selector, error) from error
     if not is_changed:
         return cell
     if found := find_asked(scope, Selector(cell.name)):
@@ -154,6 +154,15 @@ def _without_start(scope: Scope, selector: Selector) -> DoraSystemdError | None:
             hint = f"doractl start FILE --name {row.name}, or doractl deploy --name {row.name}"
             return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
     return None
+
+
+def _with_file(selector: Selector, error: DoraSystemdError) -> DoraSystemdError:
+    """Return the error; for a directory of that name, with its dataflow file as the hint."""
+    file = Path(selector.text) / DEFAULT_FILE
+    with suppress(OSError):  # the current directory was removed
+        if exists(file.absolute()):
+            return DoraSystemdError(error.message, f"did you mean {file}?", error.code)
+    return error
 
 
 def _readable(scope: Scope, selector: Selector) -> Asked | None:

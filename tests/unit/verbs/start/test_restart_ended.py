@@ -170,6 +170,19 @@ def test_the_file_of_what_has_ended(
     assert recorded_file(SCOPE, "robot", UUID) == file
 
 
+def test_the_directory_of_a_dataflow(
+    journal: FakeJournal, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """`doractl deploy DIR` takes it, `doractl start` does not."""
+    journal.write()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot/dataflow.yml").touch()
+    with pytest.raises(DoraSystemdError, match="no dataflow named 'robot'") as caught:
+        find_start(FakeManager(), SCOPE, Selector("robot"))
+    assert caught.value.hint == "did you mean robot/dataflow.yml?"
+
+
 def test_names_and_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
