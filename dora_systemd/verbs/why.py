@@ -35,7 +35,7 @@ from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.containers import read_containers
 from dora_systemd.verbs.facts.ended import newest_ended, not_recorded
 from dora_systemd.verbs.facts.held import read_held
-from dora_systemd.verbs.facts.list import mark_enabled, read_rows
+from dora_systemd.verbs.facts.list import current_text, mark_enabled, read_rows
 from dora_systemd.verbs.facts.lives import now_boot, read_lives
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_dataflow, read_status
@@ -213,7 +213,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
     is_frozen = bool(group) and cgroup.is_frozen(cgroup.group_path(group))
     return Facts(
         FROZEN if is_frozen else cell.word(status.stage),
-        problem or str(unit["StatusText"]),
+        problem or current_text(cell, str(unit["StatusText"])),
         {key: spent.get(key, str(node.exit)) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),
         now_boot(),

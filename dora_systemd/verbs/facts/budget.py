@@ -75,7 +75,7 @@ def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
     """The delay in µs: systemd waits for the shortest one, the runner for the rest."""
     if cell.word(status.stage) != RESTARTING:
         return None
-    if not cell.state.sub.startswith("auto-restart"):
+    if not cell.awaits_restart:
         return max(status.started_us - time.time_ns() // 1000, 0)
     facts: dict[str, Any] = manager.read(cell.unit, _WAITING)
     now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000

@@ -73,6 +73,11 @@ class Cell:
         return status_word(self.state.active, self.state.sub, stage, self.state.is_held)
 
     @property
+    def awaits_restart(self) -> bool:
+        """Whether its runner has ended, and systemd waits before it starts the next one."""
+        return self.state.sub.startswith("auto-restart")
+
+    @property
     def options(self) -> "RunnerOptions":
         """The options in ExecStart= of the unit.
 

@@ -53,7 +53,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "dataflow": cell.dataflow,
         "listed_release": cell.release,
         # The status is "failed" already.
-        "text": _text(unit, status).removeprefix(FAILED_BECAUSE),
+        "text": current_text(cell, _text(unit, status)).removeprefix(FAILED_BECAUSE),
         "restarts": unit["NRestarts"],
         "problem": reading.problem,
         "runner_version": status.version if status.uuid else "",
@@ -75,6 +75,14 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
 def _text(unit: Mapping[str, Any], status: CellStatus) -> str:
     """The STATUS= of a unit, or of the live table for a waiting dataflow in a row of the table."""
     return str(unit.get("StatusText", status.text if status.stage == GATHERING else ""))
+
+
+def current_text(cell: Cell, text: str) -> str:
+    """Return the STATUS= of a unit, "" for that of a runner that was killed.
+
+    systemd keeps that STATUS= until the next start, such as "2/2 nodes running".
+    """
+    return text if text.startswith(FAILED_BECAUSE) or not cell.awaits_restart else ""
 
 
 def _machines(cell: Cell) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import name_from_unit
 
 _PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
+_KILLED = ("signal", "core-dump", "watchdog")
+"""The Result= of a unit whose main process was killed."""
 _NODE = r"node (\S+): "
 _CLD_EXITED = 1
 """ExecMainCode of a process that exited, see waitid(2)."""
@@ -69,10 +71,11 @@ def failure_reason(manager: Manager, unit: str) -> str:
     facts = manager.read(unit, _PROPERTIES)
     special = result_words(facts["Result"])
     last_words = without_hint(str(facts["StatusText"])).removeprefix(FAILED_BECAUSE)
-    if not last_words:
+    is_verdict = str(facts["StatusText"]).startswith(FAILED_BECAUSE)
+    # A runner that was killed has only reported what it did before, such as "2/2 nodes running".
+    if not last_words or (facts["Result"] in _KILLED and not is_verdict):
         return special or _exit_words(facts)
     # The message of the runner explains more than its exit status.
-    is_verdict = str(facts["StatusText"]).startswith(FAILED_BECAUSE)
     cause = special or ("" if is_verdict else _exit_words(facts))
     return f"{last_words} ({cause})" if cause else last_words
 

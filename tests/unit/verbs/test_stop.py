@@ -121,6 +121,14 @@ def test_stop_that_was_cancelled() -> None:
         ),
         ({"Result": "signal", "ExecMainCode": 2, "ExecMainStatus": 9}, "signal SIGKILL"),
         ({"Result": "signal", "ExecMainCode": 2, "ExecMainStatus": 99}, "signal 99"),
+        # as when another terminal kills what this one waits for
+        (
+            {
+                **{"Result": "signal", "ExecMainCode": 2, "ExecMainStatus": 9},
+                "StatusText": "stopping, waiting for arm (killed if not ended within 1min)",
+            },
+            "signal SIGKILL",
+        ),
         (
             {"Result": "exit-code", "StatusText": "failed: node a: exit code 3"},
             "node a: exit code 3",

@@ -60,8 +60,9 @@ def manager() -> FakeManager:
     found = FakeManager()
     found.add(options("up"))
     found.add(options("again", OTHER))
-    facts = {"InactiveExitTimestamp": 10, "StatusText": "2/2 nodes running", "ExecMainCode": 2}
-    found.add(options("bad", OTHER), "failed", InactiveEnterTimestamp=20, ExecMainStatus=9, **facts)
+    facts: dict[str, Any] = {"InactiveExitTimestamp": 10, "InactiveEnterTimestamp": 20}
+    facts |= {"StatusText": "2/2 nodes running", "Result": "signal"}
+    found.add(options("bad", OTHER), "failed", ExecMainCode=2, ExecMainStatus=9, **facts)
     found.add(options("still"), "inactive", InactiveEnterTimestamp=40)
     return found
 
@@ -134,7 +135,7 @@ def test_an_end_that_is_only_known_to_systemd(
 ) -> None:
     journal.write(event)
     (row,) = [row for row in ended(manager) if row.name == "bad"]
-    assert (row.text, row.ended) == ("2/2 nodes running (signal SIGKILL)", 20)
+    assert (row.text, row.ended) == ("signal SIGKILL", 20)
 
 
 def test_an_enabled_one_that_systemd_has_loaded_again(

@@ -354,6 +354,18 @@ def test_failed_dataflow(scope: Scope) -> None:
     assert row_of(manager, scope).ended == 0
 
 
+def test_a_killed_runner_has_no_nodes_while_it_awaits_its_restart(scope: Scope) -> None:
+    """systemd keeps its STATUS= until then."""
+    manager = FakeManager()
+    facts = {"SubState": "auto-restart", "StatusText": "2/2 nodes running"}
+    manager.add(options(), active="activating", **facts)
+    assert (row_of(manager, scope).status, row_of(manager, scope).text) == ("Restarting", "")
+    report = why.explain(manager, scope, "robot", NoJournal())  # type: ignore[arg-type]
+    assert report.verdict.now == ""
+    manager.units["dora-robot.service"]["StatusText"] = "failed: node a: exit code 1"
+    assert row_of(manager, scope).text == "node a: exit code 1"
+
+
 def test_a_row_is_found_by_selector(
     scope: Scope, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
