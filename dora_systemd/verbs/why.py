@@ -33,7 +33,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import read_restarts, restart_budget, without_refused
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.containers import read_containers
-from dora_systemd.verbs.facts.ended import newest_ended, not_recorded
+from dora_systemd.verbs.facts.ended import newest_ended, not_recorded, with_cause
 from dora_systemd.verbs.facts.held import read_held
 from dora_systemd.verbs.facts.list import current_text, mark_enabled, read_rows
 from dora_systemd.verbs.facts.lives import now_boot, read_lives
@@ -262,7 +262,7 @@ def subject_row(manager: Manager, scope: Scope, subject: Subject) -> DataflowRow
     if cell is not None:
         return read_whole_rows(manager, scope, [cell])[0]
     known = DataflowRow(subject.uuid, subject.name, subject.unit, "", subject.file)
-    ended = Selector(subject.uuid).ended(scope) or known
+    ended = with_cause(scope, Selector(subject.uuid).ended(scope) or known)
     row = ended._replace(dataflow=subject.file)
     return mark_bundles(scope, mark_enabled(manager, scope, [row]))[0]
 

@@ -9,10 +9,12 @@ from dora_systemd.adapters.journal.reader import LastEvent
 from dora_systemd.decisions.life.causes import BY_SIGKILL
 from dora_systemd.decisions.logs.journal_events import EVENTS
 from dora_systemd.decisions.views.rows import DataflowRow
+from dora_systemd.decisions.why.report import Subject
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.ended import ended_row, ended_rows, newest_ended, not_recorded
 from dora_systemd.verbs.facts.list import read_rows
+from dora_systemd.verbs.why import subject_row
 from tests.unit.fakes.journal import FakeJournal, failure_record, life_record
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
@@ -120,6 +122,8 @@ def test_a_stop_that_killed_is_no_failure(manager: FakeManager, journal: FakeJou
     )
     (row,) = (row for row in ended(manager) if row.name == "gone")
     assert (row.status, row.text) == ("Stopped", "stopped by root (doractl stop); killed")
+    of_report = subject_row(manager, SCOPE, Subject(UUID, "gone", row.unit, "--system"))
+    assert (of_report.status, of_report.text) == (row.status, row.text)
 
 
 @pytest.mark.parametrize(
