@@ -189,8 +189,15 @@ def _unit_facts(manager: Manager, cell: Cell) -> tuple[int, bool]:
 def socket_of(scope: Scope, cell: Cell) -> Path:
     """The socket of the runner of a dataflow.
 
-    Raises DoraSystemdError for a runner whose answers this version does not know.
+    Raises DoraSystemdError for a runner whose answers this version does not know, and NOT_RUNNING
+    while systemd waits before it starts the next one.
     """
+    if cell.awaits_restart:
+        raise DoraSystemdError(
+            f"cannot use the dataflow {cell.name}: it waits for its restart",
+            f"doractl restart {cell.name} starts it now",
+            ExitCode.NOT_RUNNING,
+        )
     protocol = read_status(scope, cell).protocol
     if protocol != PROTOCOL:
         reason = f"it has protocol {protocol}, and this doractl has protocol {PROTOCOL}"

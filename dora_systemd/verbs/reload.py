@@ -1,7 +1,7 @@
 """`doractl reload`, and parts of `doractl set`: requests to the runner of a dataflow."""
 
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -60,12 +60,8 @@ def switch_hot_reload(
         from dora_systemd.adapters.host.watch import require_watcher
 
         require_watcher()
-    unit = manager.read(cell.unit, ("Environment", "FragmentPath", "Transient"))
-    with ExitStack() as undo:
-        remember(unit, [SettingText("", "hot_reload", format_bool(is_on))], undo)
-        manager.reload()
+    with _remembered(manager, cell, SettingText("", "hot_reload", format_bool(is_on))):
         ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
-        undo.pop_all()
 
 
 def switch_record(
@@ -79,17 +75,26 @@ def switch_record(
     refuse_parts([cell], "set")
     record, has_recorder = parse_record(text), cell.options.has("record")
     what = format_record(record)
-    unit = manager.read(cell.unit, ("Environment", "FragmentPath", "Transient"))
-    with ExitStack() as undo:
-        remember(unit, [SettingText("", "record", what)], undo)
-        manager.reload()
+    with _remembered(manager, cell, SettingText("", "record", what)):
         if has_recorder:
             ask(socket_of(scope, cell), {"verb": "record", "what": what})
-        undo.pop_all()
     if has_recorder or record is None:
         return ()
     restart = f"doractl restart {cell.name}"
     return (f"{cell.name} was started without record, and records from its restart on: {restart}",)
+
+
+@contextmanager
+def _remembered(manager: Manager, cell: Cell, change: SettingText) -> Iterator[None]:
+    """Let the next runner get a change; undone, also in systemd, if the block fails."""
+    unit = manager.read(cell.unit, ("Environment", "FragmentPath", "Transient"))
+    with ExitStack() as undo:
+        undo_last = undo.enter_context(ExitStack())
+        remember(unit, [change], undo)
+        manager.reload()
+        undo_last.callback(manager.reload)
+        yield
+        undo.pop_all()
 
 
 def remember(unit: Mapping[str, Any], changes: Iterable[SettingText], undo: ExitStack) -> None:

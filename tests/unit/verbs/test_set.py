@@ -130,6 +130,26 @@ def test_hot_reload_is_remembered_beside_the_limits(place: Place) -> None:
     assert f'Environment="{variable}"' in place.drop_in.read_text()
 
 
+def test_what_a_runner_refuses_is_undone_in_systemd_too(place: Place) -> None:
+    """Else `doractl show` would look for the drop-in, which is not there any more."""
+
+    def refuse(*_: object) -> dict[str, Any]:
+        raise DoraSystemdError("cannot watch the files")
+
+    with pytest.raises(DoraSystemdError, match="cannot watch"):
+        switch_hot_reload(place.manager, place.scope, place.cell, False, refuse)
+    assert not place.drop_in.exists()
+    assert place.manager.calls == [("reload",), ("reload",)]
+
+
+def test_a_runner_that_is_gone_is_asked_nothing(place: Place) -> None:
+    place.manager.units[place.unit]["SubState"] = "auto-restart"
+    with pytest.raises(DoraSystemdError, match="robot: it waits for its restart") as caught:
+        switch_hot_reload(place.manager, place.scope, place.cell, False)
+    assert caught.value.code is ExitCode.NOT_RUNNING
+    assert caught.value.hint == "doractl restart robot starts it now"
+
+
 @pytest.mark.parametrize(("text", "warns"), [("off", False), ("memory=4M", True)])
 def test_a_recorder_that_was_not_started_needs_a_restart(
     place: Place, text: str, warns: bool
