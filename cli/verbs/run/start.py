@@ -188,9 +188,8 @@ def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
         message, hint = f"cannot start {cell.name}: it is stopping", f"doractl list {cell.name}"
         raise DoraSystemdError(message, f"{hint} shows what it waits for", ExitCode.NAME_IN_USE)
     if cell.has_begun:
-        text = f"Dataflow already running: {cell.uuid} ({cell.name})"
         details = {"file": file, "is_ready": cell.state.active == "active"}
-        return print_outcomes([Outcome(cell, text, is_news=False, details=details)])
+        return print_outcomes([Outcome(cell, format_up(cell), is_news=False, details=details)])
     bus.hold(cell.unit)  # keep a failed transient unit
     bus.reset_failed(cell.unit)
     note = logout_note(scope)
@@ -199,6 +198,14 @@ def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
     print_warnings([note, *waiting_notes(bus, cell.options)])
     print_warnings(() if wait else held_notes(bus, cell.name))
     return _print_started(started, file, ())
+
+
+def format_up(cell: Cell) -> str:
+    """Format the answer to a start of a dataflow that need not be started."""
+    if cell.awaits_restart:
+        now = f"doractl restart {cell.name} starts it now"
+        return f"Dataflow waiting for its restart: {cell.uuid} ({cell.name}; {now})"
+    return f"Dataflow already running: {cell.uuid} ({cell.name})"
 
 
 def _print_started(started: Started, file: str, watched: Sequence[str]) -> ExitCode:

@@ -22,10 +22,13 @@ from dora_systemd.cli.group import ALIASES, HIDDEN, VERBS, doractl, run_verb
 from dora_systemd.cli.listing import ListRequest
 from dora_systemd.cli.parameters import current_scope
 from dora_systemd.cli.verbs.look.top import parse_interval
+from dora_systemd.cli.verbs.run.start import format_up
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import scope_of
+from dora_systemd.verbs.facts.cells import read_cells
 from tests.unit.checkout import module_paths
+from tests.unit.fakes.manager import UUID, FakeManager, options
 from tests.unit.project.test_manpages import all_verbs
 
 SHORT_LIVED = ("pydantic", "websockets", "watchfiles", "lxml", "rich")
@@ -57,6 +60,24 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"doractl {__version__}\n"
     assert main.run(["--user", "--version"]) == 0
     assert capsys.readouterr().out == f"doractl {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        ({}, f"Dataflow already running: {UUID} (robot)"),
+        (
+            {"ActiveState": "activating", "SubState": "auto-restart"},
+            f"Dataflow waiting for its restart: {UUID}"
+            " (robot; doractl restart robot starts it now)",
+        ),
+    ],
+)
+def test_a_start_of_what_is_up(facts: dict[str, str], words: str) -> None:
+    manager = FakeManager()
+    manager.units[manager.add(options())] |= facts
+    (cell,) = read_cells(manager)
+    assert format_up(cell) == words
 
 
 def test_bare_doractl_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
@@ -115,6 +136,15 @@ def test_the_usual_options_are_one_screen(
     assert int(count) == len(shown) + 1  # and -h
 
 
+def test_no_machine_to_check(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No output at all would look as if all of them were in order."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    assert main.run(["--user", "machine", "check"]) == 0
+    assert capsys.readouterr().out == "No machine is declared.\n"
+
+
 @pytest.mark.parametrize("name", ["node", "machine"])
 def test_the_summaries_of_a_group_are_whole(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -136,15 +166,6 @@ def test_help_of_all_options_everywhere(capsys: pytest.CaptureFixture[str]) -> N
         assert main.run([*verb, "--help=all"]) == 0
         assert capsys.readouterr().out == shown
     # Behind -- it is a word of somebody else's.
-def test_no_machine_to_check(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """No output at all would look as if all of them were in order."""
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    assert main.run(["--user", "machine", "check"]) == 0
-    assert capsys.readouterr().out == "No machine is declared.\n"
-
-
     assert main.run(["inhibit", "robot", "--help", "--", "true", "--help=all"]) == 0
 
 
