@@ -6,7 +6,7 @@ from functools import partial
 
 import click
 
-from dora_systemd.adapters.bus.manager import tell_stage
+from dora_systemd.adapters.bus.manager import Manager, tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import (
@@ -65,23 +65,24 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
     return print_outcomes(outcomes)
 
 
-def print_last_words(bus: Bus, scope: Scope, uuid: str, error: DoraSystemdError) -> str:
-    """Print the lines before the error of a start; the hint for the error."""
+def with_last_lines(
+    manager: Manager, scope: Scope, uuid: str, error: DoraSystemdError
+) -> DoraSystemdError:
+    """The error of a start with the last lines of the nodes, and the hint for these."""
     if error.code is not ExitCode.FAILURE:
-        return error.hint
+        return error
     # Imported late: most starts succeed.
     from dora_systemd.decisions.why.remedies import known_remedy
     from dora_systemd.verbs.why import words_of_start
 
-    words = words_of_start(bus, scope, uuid)
-    for line in words:
-        tell(f"  {line}", err=True)
-    return known_remedy(words) or error.hint
+    words = words_of_start(manager, scope, uuid)
+    hint = known_remedy(words) or error.hint
+    return DoraSystemdError(error.message, hint, error.code, words)
 
 
-def with_last_words(bus: Bus, scope: Scope, outcome: Outcome) -> Outcome:
-    """The outcome of a restart; if it has failed, print the lines before it."""
+def with_last_words(manager: Manager, scope: Scope, outcome: Outcome) -> Outcome:
+    """The outcome of a restart; if it has failed, with the last lines of the nodes."""
     if outcome.error is None:
         return outcome
-    hint = print_last_words(bus, scope, outcome.subject.uuid, outcome.error)
-    return outcome._replace(hint=hint)
+    error = with_last_lines(manager, scope, outcome.subject.uuid, outcome.error)
+    return outcome._replace(hint=error.hint, lines=error.lines)

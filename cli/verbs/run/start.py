@@ -215,11 +215,10 @@ def _print_started(started: Started, file: str, watched: Sequence[str]) -> ExitC
 
 @contextmanager
 def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
-    """Print the last lines of the nodes if the context fails to start the dataflow."""
+    """Add the last lines of the nodes to the error if the context fails to start the dataflow."""
     try:
         yield
     except DoraSystemdError as error:
-        from dora_systemd.cli.verbs.run.restart import print_last_words
+        from dora_systemd.cli.verbs.run.restart import with_last_lines
 
-        hint = print_last_words(bus, scope, uuid, error)
-        raise DoraSystemdError(error.message, hint, error.code) from error
+        raise with_last_lines(bus, scope, uuid, error) from error

@@ -1,6 +1,6 @@
 """The outcome of a verb for one subject: a line of text, or a JSON object."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -34,18 +34,22 @@ class Outcome(NamedTuple):
     is_news: bool = True  # whether anything had to be done
     node: str = ""
     details: Mapping[str, Any] = {}  # what else a program may need, by key
-    # hint, code: as in DoraSystemdError, of a problem
+    # hint, code, lines: as in DoraSystemdError, of a problem
     hint: str = ""
     code: ExitCode = ExitCode.FAILURE
+    lines: Sequence[str] = ()
 
     @classmethod
     def of_error(cls, subject: Subject, error: DoraSystemdError) -> "Outcome":
         """The result for a dataflow with which the error has prevented everything."""
-        return cls(subject, "", error.message, hint=error.hint, code=error.code)
+        what = subject, "", error.message
+        return cls(*what, hint=error.hint, code=error.code, lines=error.lines)
 
     @property
     def error(self) -> DoraSystemdError | None:
-        return DoraSystemdError(self.problem, self.hint, self.code) if self.problem else None
+        if not self.problem:
+            return None
+        return DoraSystemdError(self.problem, self.hint, self.code, self.lines)
 
 
 def outcome_object(one: Outcome, action: str) -> dict[str, Any]:

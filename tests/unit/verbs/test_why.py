@@ -8,10 +8,13 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.cli.verbs.run.restart import with_last_words
 from dora_systemd.decisions.logs.journal_events import EVENTS as KINDS
 from dora_systemd.decisions.logs.query import scope_matches
+from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.lives import now_boot
 from dora_systemd.verbs.why import explain, explain_now, newest_failure, words_of_start
 from tests.unit.fakes.cgroups import fake_cgroups
@@ -80,6 +83,10 @@ def test_a_failed_start_ends_with_the_words_of_the_guilty_node(
     manager.add(options(), ActiveState="failed", SubState="failed")
     play(monkeypatch, tmp_path, camera)
     assert words_of_start(manager, scope, UUID) == words
+    (cell,) = read_cells(manager)
+    problem = Outcome.of_error(cell, DoraSystemdError("cannot restart robot"))
+    found = outcome_object(with_last_words(manager, scope, problem), "restart")
+    assert found["error"]["lines"] == words
 
 
 def test_nothing_is_known(scope: ScopeIn, manager: FakeManager) -> None:
