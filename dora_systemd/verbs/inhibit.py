@@ -67,6 +67,10 @@ def take_inhibiting(scope: Scope, cell: Cell, reason: str) -> Lock:
     if not cell.has_begun:
         message = f"cannot inhibit {cell.name}: it is not running"
         raise DoraSystemdError(message, f"doractl start {cell.name}", ExitCode.NOT_RUNNING)
+    if cell.awaits_restart:
+        message = f"cannot inhibit {cell.name}: it waits for its restart"
+        hint = f"doractl restart {cell.name} starts it now"
+        raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING)
     directory = scope.cell_directory(cell.name)
     lock = Lock(directory, reason)
     if not lock.take():

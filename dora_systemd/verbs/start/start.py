@@ -272,6 +272,7 @@ def _in_use(manager: Manager, cell: Cell) -> DoraSystemdError:
         return DoraSystemdError(message, hint, ExitCode.NAME_IN_USE)
     since = manager.read(cell.unit, ["InactiveExitTimestamp"])["InactiveExitTimestamp"]
     does = "waits for its start" if cell.state.is_held else f"runs since {local_time(since)}"
+    does = "waits for its restart" if cell.awaits_restart else does
     return DoraSystemdError(
         f"cannot start {cell.name}: dataflow {cell.uuid} of that name {does} "
         f"from {cell.options.dataflow}",

@@ -298,3 +298,8 @@ def test_what_does_not_run_cannot_be_inhibited(scope: ScopeIn, manager: FakeMana
     with pytest.raises(DoraSystemdError, match="it is not running") as caught:
         take_inhibiting(scope, cell, "x")
     assert caught.value.code is ExitCode.NOT_RUNNING
+    manager.add(options(), active="activating", SubState="auto-restart")
+    (cell,) = read_cells(manager)
+    with pytest.raises(DoraSystemdError, match="it waits for its restart") as caught:
+        take_inhibiting(scope, cell, "x")
+    assert caught.value.code is ExitCode.NOT_RUNNING

@@ -84,6 +84,12 @@ def test_a_name_of_one_that_is_stopping(manager: FakeManager, scope: Scope) -> N
     assert caught.value.hint.startswith("doractl stop robot waits for its end")
 
 
+def test_a_name_of_one_that_waits_for_its_restart(manager: FakeManager, scope: Scope) -> None:
+    manager.add(options(), active="activating", SubState="auto-restart")
+    with pytest.raises(DoraSystemdError, match="of that name waits for its restart from /srv/"):
+        require_free_name(manager, scope, UNIT)
+
+
 @pytest.mark.parametrize("state", ["active", "activating", "reloading"])
 def test_a_name_in_use(state: str, manager: FakeManager, scope: Scope) -> None:
     manager.add(options(), active=state, InactiveExitTimestamp=1_700_000_000_000_000)
