@@ -38,7 +38,7 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask | None = No
     """
     require_running(cell)
     refuse_parts([cell], "reload")
-    _refuse_release(cell)
+    _refuse_release(cell, f"reload {cell.name}")
     if node is not None:
         require_node(scope, cell, node)
     path, ask = socket_of(scope, cell), ask or patient(cell)
@@ -54,7 +54,7 @@ def switch_hot_reload(
     """
     require_running(cell)
     refuse_parts([cell], "set")
-    _refuse_release(cell)
+    _refuse_release(cell, f"set the hot reload of {cell.name}")
     if is_on:
         # Imported late: asyncio is slow to import.
         from dora_systemd.adapters.host.watch import require_watcher
@@ -141,8 +141,8 @@ def _rates_request(rates: RateLimits) -> Mapping[str, Any]:
     return {"verb": "log-rates", "limits": [*map(format_setting, rate_texts(rates))]}
 
 
-def _refuse_release(cell: Cell) -> None:
+def _refuse_release(cell: Cell, action: str) -> None:
     """Raise DoraSystemdError (USAGE) for a deployed dataflow, whose files do not change."""
     if release := release_of(cell.options.dataflow):
-        message = f"cannot reload {cell.name}: the files of its release {release} do not change"
+        message = f"cannot {action}: the files of its release {release} do not change"
         raise usage_error(message, f"doractl deploy --name {cell.name} brings a new version")

@@ -150,6 +150,13 @@ def test_a_runner_that_is_gone_is_asked_nothing(place: Place) -> None:
     assert caught.value.hint == "doractl restart robot starts it now"
 
 
+def test_a_release_has_no_hot_reload(place: Place) -> None:
+    file = "/var/lib/dora-systemd/releases/robot/20261129T005719/tree/dataflow.yml"
+    place.manager.add(options()._replace(dataflow=file))
+    with pytest.raises(DoraSystemdError, match="cannot set the hot reload of robot: the files of"):
+        switch_hot_reload(place.manager, place.scope, place.cell, True)
+
+
 @pytest.mark.parametrize(("text", "warns"), [("off", False), ("memory=4M", True)])
 def test_a_recorder_that_was_not_started_needs_a_restart(
     place: Place, text: str, warns: bool
