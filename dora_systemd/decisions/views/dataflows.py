@@ -86,7 +86,7 @@ _OPTIONAL = (
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12
 _ROOM = {
-    **dict.fromkeys(("HOST", "NAME", "NODE", "EXIT"), _LEAST),
+    **dict.fromkeys(("HOST", "NAME", "NODE", "EXIT", "COMMAND"), _LEAST),
     **dict.fromkeys(("WHY", "STATUS TEXT"), 24),
 }
 """Columns whose cells may be cut to _LEAST, and the width for which other columns are left out."""
