@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 _SHOWN = 10
 _PATTERN = r"[*?\[]"
+_NOTHING = "nothing is running; ended ones: doractl list --all"
+_TOO_SHORT = f"the beginning of a UUID must have at least {MIN_PREFIX} characters"
 OF_SYSTEM = "a dataflow of that name runs in system scope: add --system, or use sudo"
 
 
@@ -106,11 +108,11 @@ class Selector(NamedTuple):
         known = sorted({*names}.difference(self.names))
         is_there = is_of_system(self.names)
         hint = OF_SYSTEM if is_there else did_you_mean(self.text, known)
-        if not hint and len(self.text) < MIN_PREFIX and is_uuid_prefix(self.text, 1):
-            hint = f"the beginning of a UUID must have at least {MIN_PREFIX} characters"
-        if not hint and known:
-            hint = f"known dataflows: {', '.join(known[:_SHOWN])}"
-        hint = hint or "nothing is running; ended ones: doractl list --all"
+        if not hint:
+            there = f"known dataflows: {', '.join(known[:_SHOWN])}" if known else _NOTHING
+            # Also the text of a name such as "bad".
+            is_short = len(self.text) < MIN_PREFIX and is_uuid_prefix(self.text, 1)
+            hint = f"{there}; {_TOO_SHORT}" if is_short else there
         return DoraSystemdError(f"no dataflow named {quoted(self.text)}", hint, ExitCode.NOT_FOUND)
 
     def proven(self, cells: Iterable[Cell]) -> Cell | None:

@@ -80,14 +80,17 @@ def test_an_ambiguous_prefix_lists_what_it_fits(cells: list[Cell]) -> None:
     assert f"{OTHER} (vision)" in caught.value.hint
 
 
+KNOWN = "known dataflows: abcdef00, robot, vision"
+
+
 @pytest.mark.parametrize(
     ("selector", "hint"),
     [
         ("robto", "did you mean robot?"),
-        ("zzzz", "known dataflows: abcdef00, robot, vision"),
-        ("550", "the beginning of a UUID must have at least 4 characters"),
-        ("55", "the beginning of a UUID must have at least 4 characters"),
-        ("5x", "known dataflows: abcdef00, robot, vision"),
+        ("zzzz", KNOWN),
+        ("550", f"{KNOWN}; the beginning of a UUID must have at least 4 characters"),
+        ("bad", f"{KNOWN}; the beginning of a UUID must have at least 4 characters"),
+        ("5x", KNOWN),
     ],
 )
 def test_nothing_fits(cells: list[Cell], selector: str, hint: str) -> None:
