@@ -190,7 +190,8 @@ def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) ->
     """Raise DoraSystemdError (USAGE) unless a command line has either names or --all."""
     if bool(selectors) == want_all:
         hint = f"doractl {verb} NAME, or doractl {verb} --all"
-        raise usage_error(f"cannot {verb}: give names or --all", hint)
+        both = ", not both" if want_all else ""
+        raise usage_error(f"cannot {verb}: give names or --all{both}", hint)
 
 
 def print_outcomes(outcomes: Iterable[Outcome]) -> ExitCode:

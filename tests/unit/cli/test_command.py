@@ -207,7 +207,7 @@ def test_every_option_says_what_it_does(name: str) -> None:
         ),
         (["why", "--bundle", ""], "cannot read '': no path", "doractl why --bundle FILE"),
         (["stop"], "cannot stop: give names or --all", "doractl stop NAME, or doractl stop --all"),
-        (["stop", "x", "--all"], "cannot stop: give names or --all", ""),
+        (["stop", "x", "--all"], "cannot stop: give names or --all, not both", ""),
         (["show"], "missing argument", "see doractl show --help"),
         (["start", "--watch"], "option '--watch' requires an argument", "see doractl start --help"),
         (["list", "a", "b"], "got unexpected extra", ""),
