@@ -21,6 +21,8 @@ TITLES = {
     "machine": "This machine",
 }
 _HEADING = "Examples:"
+_MOST_MEANT = 3
+"""Commands in the hint for an unknown one, if they begin with it."""
 SECTIONS = tuple(TITLES)
 """The directories of verbs/, in the order of --help."""
 
@@ -239,10 +241,12 @@ def _meant_verb(name: str, verbs: Iterable[str], group: str = "") -> str:
     """The hint for an unknown verb, or one of a group; "" if no command is similar."""
     from difflib import get_close_matches
 
-    near = [f"{group} {one}".strip() for one in get_close_matches(name, verbs, n=1)]
-    known = WORDS_OF_OTHERS.get(f"{group} {name}".strip())
-    meant = known or next(iter(near), "")
-    return f"did you mean doractl {meant}?" if meant else ""
+    if known := WORDS_OF_OTHERS.get(f"{group} {name}".strip()):
+        return f"did you mean doractl {known}?"
+    longer = [one for one in verbs if len(name) > 1 and one.startswith(name)]
+    near = longer if 0 < len(longer) <= _MOST_MEANT else get_close_matches(name, verbs, n=1)
+    meant = " or ".join(" ".join(filter(None, ("doractl", group, one))) for one in near)
+    return f"did you mean {meant}?" if meant else ""
 
 
 def _near(error: click.NoSuchOption) -> list[str]:

@@ -190,6 +190,12 @@ def test_every_option_says_what_it_does(name: str) -> None:
     [
         (["strat"], "unknown command 'strat'", "did you mean doractl start?"),
         (["ls"], "unknown command 'ls'", "did you mean doractl list?"),
+        (
+            ["st"],
+            "unknown command 'st'",
+            "did you mean doractl start or doractl stop or doractl status?",
+        ),
+        (["ver"], "unknown command 'ver'", "did you mean doractl version?"),
         (["tail"], "unknown command 'tail'", "did you mean doractl logs NAME --follow?"),
         (["biuld"], "unknown command 'biuld'", "did you mean doractl build?"),
         (["qqq"], "unknown command 'qqq'", "doractl --help lists all commands"),
