@@ -4,6 +4,8 @@ import json
 import os
 import re
 import shutil
+import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -203,6 +205,32 @@ def test_a_reload_in_between_changes_nothing(boots: Cell, project: Project) -> N
     # The same again is the enabled one.
     assert f"Dataflow started: {uuid}\n" in boots.start(flow).stdout
     assert facts(boots) == (str(ETC / boots.unit), "enabled")
+
+
+_KILLED = """
+import os, signal, sys
+def hook(event, arguments):
+    if event == "os.remove" and "/system.control/" in str(arguments[0]):
+        os.kill(os.getpid(), signal.SIGKILL)
+sys.addaudithook(hook)
+from dora_systemd.cli.main import main
+main()
+"""
+"""A doractl that is killed when the unit file of an ended transient unit is about to count."""
+
+
+@pytest.mark.usefixtures("target")
+def test_a_killed_stop_leaves_it_enabled(boots: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    boots.start(flow)
+    boots.doractl("enable", boots.name)
+    run("systemctl", "daemon-reload")
+    words = (sys.executable, "-c", _KILLED, "--system", "stop", boots.name)
+    assert run(*words, check=False).returncode == -signal.SIGKILL
+    assert run("systemctl", "is-enabled", boots.unit).stdout == "enabled\n"
+    boots.start(flow)
+    assert facts(boots) == (str(ETC / boots.unit), "enabled")
+    assert boots.show("WantedBy") == "dora.target"
 
 
 @pytest.mark.parametrize("way", ["started", "enabled", "both"])

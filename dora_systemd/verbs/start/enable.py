@@ -5,6 +5,7 @@ systemd looks into /run/systemd/transient first. Never remove that fragment whil
 loaded: systemd would delete the file in /etc instead when it unloads the unit.
 """
 
+import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -20,8 +21,10 @@ from dora_systemd.adapters.host.unit_files import (
     put_unit_file,
     read_unit_file,
     remove_changes,
+    remove_empty,
     remove_unit_file,
     sync_links,
+    write_link,
     write_unit_file,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -275,16 +278,35 @@ def remove_files(manager: Manager, paths: Sequence[Path]) -> None:
 def release_transient(manager: Manager, boot: BootUnit) -> None:
     """Have systemd unload an ended transient unit, so that the enabled file takes effect.
 
-    systemd unloads the unit, with its fragment, only while no target wants the unit: drop the link
-    for a moment.
+    systemd unloads the unit, with its fragment, only while no target wants the unit. So links to
+    /dev/null, which a reboot removes, hide those that enable the unit. Those stay on the disk:
+    if this process is killed or the power fails, the dataflow is still enabled.
     """
-    manager.disable_unit_files([boot.unit])
     try:
+        for mask in _masks(boot):
+            write_link(mask, os.devnull)
         manager.reload()
         wait_until_forgotten(manager, boot.unit)
     finally:
-        manager.enable_unit_files([str(boot.path)])
+        unmask(boot)
         manager.reload()
+
+
+def unmask(boot: BootUnit) -> bool:
+    """Remove what hides the links of a unit; whether there was any, as of a killed command."""
+    masks = [one for one in _masks(boot) if one.is_symlink()]
+    for mask in masks:
+        remove_unit_file(mask)
+        remove_empty(mask.parent)
+    return bool(masks)
+
+
+def _masks(boot: BootUnit) -> list[Path]:
+    """The paths that have precedence over the links by which targets start a unit."""
+    fleeting = boot.runtime.parent
+    control = fleeting.with_name(f"{fleeting.name}.control")
+    links = boot.path.parent.glob(f"*.wants/{boot.unit}")
+    return sorted(control / link.parent.name / link.name for link in links)
 
 
 def wait_until_forgotten(manager: Manager, unit: str, most: float = _FORGET_SECONDS) -> None:

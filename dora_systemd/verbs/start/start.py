@@ -30,6 +30,7 @@ from dora_systemd.verbs.start.enable import (
     link_paths,
     read_boot_unit,
     release_transient,
+    unmask,
     wait_until_forgotten,
 )
 from dora_systemd.verbs.start.plan import Plan, make_plan
@@ -120,8 +121,8 @@ def make_room(manager: Manager, boot: BootUnit) -> None:
         _forget(manager, boot)
     elif boot.text is None:
         return
-    elif manager.read(boot.unit, ["LoadState"])["LoadState"] == "not-found":
-        manager.reload()  # see lost_units()
+    elif unmask(boot) or manager.read(boot.unit, ["LoadState"])["LoadState"] == "not-found":
+        manager.reload()  # for "not-found" see lost_units()
 
 
 def refuse_unit_file(boot: BootUnit) -> None:

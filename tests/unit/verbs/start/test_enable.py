@@ -214,21 +214,26 @@ def test_disabled_while_it_runs_from_its_file(manager: FakeManager, scope: Scope
 def test_after_its_end_the_file_counts(
     manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """It stays enabled meanwhile, in case that this process is killed."""
     cell = started(manager)
     enable_cell(manager, scope, cell)
     manager.calls.clear()
     manager.after_job[UNIT] = {"ActiveState": "inactive"}
-    real = manager.disable_unit_files
+    mask = scope.runtime_root / "systemd/system.control/dora.target.wants" / UNIT
+    real, seen = manager.reload, []
 
-    def disable(units: list[str]) -> None:
-        real(units)
-        manager.units[UNIT]["Transient"] = False
+    def reload() -> None:
+        real()
+        is_hidden = mask.is_symlink() and str(mask.readlink()) == os.devnull
+        seen.append((is_hidden, enabled_units(manager, scope)))
+        manager.units[UNIT]["Transient"] &= not is_hidden
 
-    monkeypatch.setattr(manager, "disable_unit_files", disable)
+    monkeypatch.setattr(manager, "reload", reload)
+    manager.units[UNIT]["Transient"] = True
     stop_cells(manager, scope, [cell])
-    link = ("enable", str(path_of(manager)))
-    stop = ("StopUnit", UNIT)
-    assert manager.calls == [stop, ("disable", UNIT), ("reload",), link, ("reload",)]
+    assert seen == [(True, frozenset({UNIT})), (False, frozenset({UNIT}))]
+    assert manager.calls == [("StopUnit", UNIT), ("reload",), ("reload",)]
+    assert not mask.parent.exists()
 
 
 def test_what_descriptors_hold_is_let_go(manager: FakeManager) -> None:

@@ -1,11 +1,13 @@
 """A name that is to be started: free, in use, enabled with the same settings or with others."""
 
+import os
 import pwd
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from dora_systemd.adapters.host.unit_files import write_link
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.file import runner_of
@@ -209,8 +211,18 @@ def test_an_ended_transient_one_makes_room_for_its_file(manager: FakeManager, sc
     manager.add(options(), active="failed")
     manager.calls.clear()
     assert place(manager, make_plan(scope))
-    link = ("enable", str(unit_file(manager)))
-    assert manager.calls == [("reset", UNIT), ("disable", UNIT), ("reload",), link, ("reload",)]
+    assert manager.calls == [("reset", UNIT), ("reload",), ("reload",)]
+
+
+def test_what_a_killed_start_has_hidden_is_wanted_again(manager: FakeManager, scope: Scope) -> None:
+    place(manager, make_plan(scope), want_boot=True)
+    manager.add(options(), active="inactive", Transient=False)
+    mask = scope.runtime_root / "systemd/system.control/dora.target.wants" / UNIT
+    write_link(mask, os.devnull)
+    manager.calls.clear()
+    assert place(manager, make_plan(scope))
+    assert manager.calls == [("reload",)]
+    assert not mask.parent.exists()
 
 
 def user(name: str) -> pwd.struct_passwd:
