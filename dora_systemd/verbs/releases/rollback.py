@@ -1,5 +1,6 @@
 """`doractl rollback`: an older release proves itself once more, and takes the place of this one."""
 
+import pwd
 from functools import partial
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -9,7 +10,7 @@ from dora_systemd.decisions.logs.journal_events import ROLLED_BACK
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.past import before
 from dora_systemd.decisions.releases.progress import checking, waiting
-from dora_systemd.decisions.unit.file import runner_of
+from dora_systemd.decisions.unit.file import runner_of, user_of
 from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.names import did_you_mean, unit_name
@@ -74,6 +75,7 @@ def roll_back(
         if chosen != standing.current or not standing.trial:  # a trial has to end in any case
             tell(checking())
             _require_intact(store, manifest)
+            _require_user(store, chosen, user_of(text))
         # One that was disabled stays so.
         change = Change(chosen, text, options, soak, False, "rollback", how, by)
         gate = partial(Gate, may_wait=may_wait)
@@ -99,6 +101,16 @@ def _require_intact(store: Store, manifest: Manifest) -> None:
         reason = f"{shown(damaged[0])}{more} changed on the disk"
         message = f"cannot run release {manifest.id} of {store.name}: it is damaged: {reason}"
         raise bad_input(message, f"check the disk; doractl releases {store.name} lists the others")
+
+
+def _require_user(store: Store, release: str, user: str) -> None:
+    """Refuse a release whose user is gone: its start would fail after the stop of what runs."""
+    try:
+        if user:
+            pwd.getpwnam(user)
+    except KeyError as error:
+        message = f"cannot run release {release} of {store.name}: there is no user {shown(user)}"
+        raise bad_input(message, "create that user, or deploy again with --uid USER") from error
 
 
 def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell: Tell) -> Deployed:

@@ -80,6 +80,18 @@ def test_a_damaged_release_is_refused(
     assert manager.calls[before:] == []
 
 
+def test_a_release_whose_user_is_gone_is_refused(
+    manager: FakeManager, scope: Scope, store: Store
+) -> None:
+    """Else the dataflow would be down, and the release marked as failed, which it is not."""
+    manager.add(release_options(NEW), "active", Transient=False)
+    store.write_unit(OLD, text_of(OLD, "gone"))
+    with pytest.raises(DoraSystemdError, match="there is no user gone") as caught:
+        roll_back(manager, scope, "robot", OLD, 0, print)
+    assert caught.value.code == ExitCode.BAD_INPUT
+    assert manager.calls == []
+
+
 def test_a_release_without_its_files_is_named(
     manager: FakeManager, scope: Scope, store: Store
 ) -> None:

@@ -32,8 +32,8 @@ def release_options(release: str) -> RunnerOptions:
     return options(dataflow=f"{place}/dataflow.yml", working_directory=place)
 
 
-def text_of(release: str) -> str:
-    context = UnitContext("/usr/bin/python3", False, "dora", {})
+def text_of(release: str, user: str = "root") -> str:
+    context = UnitContext("/usr/bin/python3", False, user, {})
     properties = unit_properties(release_options(release), context, resolve_settings({}, {}, []))
     return f"{format_unit(properties)}\n[Install]\nWantedBy=multi-user.target\n"
 
