@@ -187,6 +187,27 @@ def test_a_stop_in_the_first_moments_of_a_life(boots: Cell, project: Project) ->
     assert boots.events()[-1] == ("dataflow-stopped", "")
 
 
+@pytest.mark.warns("Main process exited", "Failed with result", "supervisor process was killed")
+def test_a_stop_that_calls_a_restart_off(boots: Cell, project: Project) -> None:
+    """Nothing of it runs from the kill on, and every view says so."""
+    policy = ("--restart-policy", "always", "--restart-delay", "60s", "--max-restart-delay", "60s")
+    boots.start(project.three_nodes(), "--enable", *policy)
+    boots.systemctl("kill", "--signal=KILL", "--kill-whom=main")
+    wait_for("its restart is due", lambda: boots.show("SubState") == "auto-restart")
+    assert said(boots, "list") == said(boots, "why") == ("Restarting", None)
+    boots.doractl("stop", boots.name)
+    assert boots.show("LoadState") == "loaded"
+    killed = ("Failed", "the supervisor process was killed (SIGKILL)")
+    assert said(boots, "list") == killed
+    assert said(boots, "why")[0] == "Failed"
+
+
+def said(cell: Cell, verb: str) -> tuple[str, str | None]:
+    """The status that `list` or `why` gives of a dataflow, and its text."""
+    found = json.loads(cell.doractl(verb, cell.name, "-o", "json", check=False).stdout)
+    return found["status"], found["text"]
+
+
 @pytest.mark.usefixtures("target")
 def test_a_reload_in_between_changes_nothing(boots: Cell, project: Project) -> None:
     """The target holds the transient unit then; doractl has it forgotten."""

@@ -24,7 +24,7 @@ from dora_systemd.verbs.facts.reason import failure_reason
 
 _WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _MOST_NAMES = 100
-_TIMES = ("InactiveEnterTimestamp", "InactiveExitTimestamp")
+_TIMES = ("InactiveEnterTimestamp", "InactiveExitTimestamp", "ExecMainStartTimestamp")
 
 
 def ended_rows(scope: Scope, rows: Sequence[DataflowRow] = ()) -> list[DataflowRow]:
@@ -86,8 +86,12 @@ def read_end(manager: Manager, scope: Scope, row: DataflowRow) -> DataflowRow:
 def _with_end(manager: Manager, row: DataflowRow, event: LastEvent | None) -> DataflowRow:
     # The event has more facts than systemd, which unloads an enabled unit, too. But a failure
     # before the start of the runner has no event.
-    times = manager.read(row.unit, _TIMES)
-    is_own = event and event.uuid == row.uuid and event.at_us >= times["InactiveExitTimestamp"]
+    times = manager.read(row.unit, (*_TIMES, "Result"))
+    # A wait for a restart sets InactiveExitTimestamp=, too. After a stop that calls the restart off
+    # the unit is inactive, with the result of its failure.
+    is_called_off = row.status != FAILED and times["Result"] != "success"
+    began = times["ExecMainStartTimestamp" if is_called_off else "InactiveExitTimestamp"]
+    is_own = event and event.uuid == row.uuid and event.at_us >= began
     own = event if is_own else None
     row = row._replace(ended=times["InactiveEnterTimestamp"] or (own.at_us if own else 0))
     if own and own.event == "dataflow-failed":  # a stop that calls its restart off changes nothing

@@ -95,16 +95,23 @@ def test_one_row_for_each_name_that_does_not_run(
 
 
 @pytest.mark.parametrize(
-    ("began", "shown"),
-    [(30, ("Failed", "node a: exit code 1", 40)), (39, ("Stopped", "", 40))],
+    ("began", "result", "shown"),
+    [
+        (30, "exit-code", ("Failed", "node a: exit code 1", 40)),
+        (39, "success", ("Stopped", "", 40)),
+    ],
     ids=["no later life", "it was started again, and stopped"],
 )
 def test_a_stop_that_calls_a_restart_off_leaves_it_failed(
-    manager: FakeManager, journal: FakeJournal, began: int, shown: tuple[str, str, int]
+    manager: FakeManager,
+    journal: FakeJournal,
+    began: int,
+    result: str,
+    shown: tuple[str, str, int],
 ) -> None:
-    """systemd calls it inactive then, as after any stop."""
-    facts = {"InactiveExitTimestamp": began, "InactiveEnterTimestamp": 40}
-    manager.add(options("still"), "inactive", **facts)
+    """systemd calls it inactive then, as after any stop, and since 39 it waited to restart it."""
+    facts = {"ExecMainStartTimestamp": began, "InactiveExitTimestamp": 39, "Result": result}
+    manager.add(options("still"), "inactive", InactiveEnterTimestamp=40, **facts)
     journal.write(life_record("dataflow-failed", 35, "still", DORA_REASON="node a: exit code 1"))
     (row,) = (row for row in ended(manager) if row.name == "still")
     assert (row.status, row.text, row.ended) == shown
