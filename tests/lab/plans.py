@@ -37,7 +37,7 @@ CONTAINERS = 3
 # A step that takes so many times longer than it should hangs: it fails, and the others are shown.
 # A machine may have half of the speed, and images are built in the minutes of the first that asks.
 PATIENCE = 5
-LEAST_LONGEST = 20
+LEAST_LONGEST = 40
 # Unit tests that need mandoc, fish, zsh, mcap or pyarrow, which the lab has.
 WITH_TOOLS = (
     "tests/unit/cli/test_completions.py",
