@@ -9,7 +9,7 @@ from dora_systemd.terminal_text import short_line, without_sequences
 SSH_FAILED = 255
 _OF_SSH = (
     rb"(?:Connection to \S+ closed by remote host\.|Timeout, server \S+ not responding\."
-    rb"|client_loop: [^\n]*)\r?\n"
+    rb"|client_loop: [^\n]*)"
 )
 _MOST = 200
 _HINT = "hint: "
@@ -43,8 +43,12 @@ def _by_ssh(host: Host) -> str:
 
 
 def lost(host: Host, words: str = "") -> DoraSystemdError:
-    """The error of a host that was reached, and then lost."""
-    reason = f": {last_line(words)}" if words else ""
+    """Return the error of a host that was reached, and then lost.
+
+    words: what ssh and doractl on the host have written; only ssh knows why it is lost.
+    """
+    said = re.findall(_OF_SSH, words.encode())
+    reason = f": {last_line(said[-1].decode())}" if said else ""
     hint = f"what was asked may be done or not: doractl -H {host.text} list"
     return _error(f"the connection to {host.text} is lost{reason}", hint)
 
@@ -86,7 +90,7 @@ def too_much(host: Host) -> DoraSystemdError:
 
 def is_of_ssh(data: bytes) -> bool:
     """Return whether ssh wrote this about a lost connection, which the error repeats."""
-    return re.fullmatch(_OF_SSH, data) is not None
+    return re.fullmatch(_OF_SSH + rb"\r?\n", data) is not None
 
 
 def _error(message: str, hint: str) -> DoraSystemdError:

@@ -89,7 +89,12 @@ def test_objects_have_their_host() -> None:
             "cannot reach alice@a: the host key has changed",
         ),
         (255, False, "", "", "cannot reach alice@a: ssh failed"),
-        (255, True, "", "Broken pipe", "the connection to alice@a is lost: Broken pipe"),
+        (
+            *(255, True, "", "trial: starting\nclient_loop: send disconnect: Broken pipe\r\n"),
+            "the connection to alice@a is lost: client_loop: send disconnect: Broken pipe",
+        ),
+        (255, True, "", "trial: 1/1 nodes ready\n", "the connection to alice@a is lost"),
+        (255, True, "", '{"progress": {}}\n', "the connection to alice@a is lost"),
         (-9, True, "", "", "the connection to alice@a is lost"),
         (127, True, "", "", "cannot find doractl on alice@a"),
         (1, False, "Not available.\n", "", "cannot run doractl on alice@a: Not available."),
