@@ -50,11 +50,16 @@ def daemon_command(dora: str, port: int, local_listen_port: int) -> list[str]:
     return [dora, "daemon", *coordinator, *own]
 
 
-def free_port() -> int:
-    """A TCP port of the loopback interface that is free at the moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def reserved_port() -> socket.socket:
+    """A socket that keeps a free TCP port of the loopback interface from all but a daemon.
+
+    The kernel gives such a port to nobody who lets the kernel choose. A daemon of dora can listen
+    on it, because it sets SO_REUSEADDR, too, see socket(7). Raises OSError.
+    """
+    held = socket.socket()
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    held.bind(("127.0.0.1", 0))
+    return held
 
 
 class Child(NamedTuple):

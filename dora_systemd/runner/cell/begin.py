@@ -4,6 +4,7 @@ import contextlib
 import os
 import pwd
 import resource
+import socket
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -141,7 +142,12 @@ class Daemon(NamedTuple):
     """A daemon of dora."""
 
     child: engine.Child
-    listen: int  # its port for dynamic nodes
+    held: socket.socket  # its port for dynamic nodes; held as long as it runs
+
+    @property
+    def listen(self) -> int:
+        """Its port for dynamic nodes."""
+        return int(self.held.getsockname()[1])
 
 
 def start_daemon(
@@ -158,10 +164,13 @@ def start_daemon(
     machine. more: arguments.
     """
     paths.daemon.mkdir(mode=0o700, exist_ok=True)
-    listen = engine.free_port()
     own = {**environment, "DORA_AUTH_TOKEN": token or read_token(paths)}
-    command = [*engine.daemon_command(dora, port, listen), *more]
-    return Daemon(engine.spawn("daemon", command, own, paths.daemon), listen)
+    with contextlib.ExitStack() as undo:
+        held = undo.enter_context(engine.reserved_port())
+        command = [*engine.daemon_command(dora, port, held.getsockname()[1]), *more]
+        child = engine.spawn("daemon", command, own, paths.daemon)
+        undo.pop_all()
+    return Daemon(child, held)
 
 
 def read_token(paths: CellPaths) -> str:

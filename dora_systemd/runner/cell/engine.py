@@ -3,6 +3,7 @@
 import asyncio
 import json
 import signal
+import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import Any
@@ -57,6 +58,7 @@ class Engine:
         self._requests: control.Connection | None = None
         self._lock = asyncio.Lock()
         self._port = 0
+        self._held: socket.socket | None = None
         self._token = ""
 
     def start_coordinator(self) -> engine.Child:
@@ -95,6 +97,7 @@ class Engine:
             given = (self._dora, self._paths, self._port, {**self._environment, **added})
             daemon = start_daemon(*given, self._token, self._more)
         self._children[daemon.child.label] = daemon.child
+        self._held = daemon.held
         self._write_access(daemon)
         return daemon.child
 
@@ -178,7 +181,9 @@ class Engine:
             self._requests.close()
         boot, self._boot = self._boot, None
         if boot and (daemon := boot.daemon()):
-            self._children[daemon.child.label] = daemon.child
+            self._children[daemon.child.label], self._held = daemon.child, daemon.held
+        if self._held:
+            self._held.close()
         for child in self._children.values():
             child.send_signal(signal.SIGKILL)
         for child in self._children.values():

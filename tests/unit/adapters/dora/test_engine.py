@@ -3,6 +3,7 @@
 import asyncio
 import os
 import signal
+import socket
 import time
 from pathlib import Path
 
@@ -79,8 +80,14 @@ def test_a_program_that_is_not_there(tmp_path: Path) -> None:
         raise AssertionError
 
 
-def test_a_free_port_is_free() -> None:
-    assert 0 < engine.free_port() < 65536
+def test_a_reserved_port_is_for_a_daemon_only() -> None:
+    with engine.reserved_port() as held, socket.socket() as other, socket.socket() as daemon:
+        with pytest.raises(OSError, match="already in use"):
+            other.bind(held.getsockname())
+        daemon.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        daemon.bind(held.getsockname())
+        daemon.listen()
+        socket.create_connection(held.getsockname()).close()
 
 
 PORT = "echo first; printf 'Listening on port 47'; echo 11; echo more; exec sleep 1000"

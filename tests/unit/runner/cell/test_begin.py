@@ -127,6 +127,7 @@ def test_a_coordinator_and_a_daemon(paths: CellPaths, tmp_path: Path) -> None:
         assert command.endswith(" --more")
         assert "6666" in command
         assert str(started.listen) in command
+        started.held.close()
         assert f"DORA_AUTH_TOKEN={wanted}\n" in second
         assert "MINE=yes" in second
     assert paths.daemon.stat().st_mode & 0o777 == 0o700
