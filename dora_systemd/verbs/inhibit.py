@@ -15,7 +15,7 @@ from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.trust.locks import find_lock, open_lock, place_of, take_lock, write_reason
-from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.cells import Cell, read_cells, restart_due
 from dora_systemd.verbs.facts.locks import holders_of, read_cell_flocks, read_holders
 
 RENEW_SECONDS = 1.0
@@ -68,9 +68,7 @@ def take_inhibiting(scope: Scope, cell: Cell, reason: str) -> Lock:
         message = f"cannot inhibit {cell.name}: it is not running"
         raise DoraSystemdError(message, f"doractl start {cell.name}", ExitCode.NOT_RUNNING)
     if cell.awaits_restart:
-        message = f"cannot inhibit {cell.name}: it waits for its restart"
-        hint = f"doractl restart {cell.name} starts it now"
-        raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING)
+        raise restart_due(cell, f"cannot inhibit {cell.name}")
     directory = scope.cell_directory(cell.name)
     lock = Lock(directory, reason)
     if not lock.take():

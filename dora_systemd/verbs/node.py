@@ -23,7 +23,7 @@ from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_e
 from dora_systemd.trust.sockets import require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import SECOND, quoted
-from dora_systemd.verbs.facts.cells import CONTROL, Cell, refuse_parts
+from dora_systemd.verbs.facts.cells import CONTROL, Cell, refuse_parts, restart_due
 from dora_systemd.verbs.facts.locks import IfInhibited, Tell, require_uninhibited
 from dora_systemd.verbs.facts.reading import read_status
 
@@ -193,11 +193,7 @@ def socket_of(scope: Scope, cell: Cell) -> Path:
     while systemd waits before it starts the next one.
     """
     if cell.awaits_restart:
-        raise DoraSystemdError(
-            f"cannot use the dataflow {cell.name}: it waits for its restart",
-            f"doractl restart {cell.name} starts it now",
-            ExitCode.NOT_RUNNING,
-        )
+        raise restart_due(cell, f"cannot use the dataflow {cell.name}")
     protocol = read_status(scope, cell).protocol
     if protocol != PROTOCOL:
         reason = f"it has protocol {protocol}, and this doractl has protocol {PROTOCOL}"

@@ -185,6 +185,12 @@ def _read_options(manager: Manager, unit: str) -> "tuple[RunnerOptions | None, s
     return (options, problem) if name_from_unit(unit) == options.name else (None, "")
 
 
+def restart_due(cell: Cell, problem: str) -> DoraSystemdError:
+    """The error (NOT_RUNNING) for what needs a runner while systemd waits to start the next one."""
+    hint = f"doractl restart {cell.name} starts it now"
+    return DoraSystemdError(f"{problem}: it waits for its restart", hint, ExitCode.NOT_RUNNING)
+
+
 def refuse_parts(cells: Iterable[Cell], verb: str) -> None:
     """Raise DoraSystemdError (FAILURE) for a part, which names the machine to go to."""
     for cell in cells:
