@@ -155,12 +155,17 @@ class Reloader:
         while True:
             await self._wake.wait()
             await self._begun.wait()
-            self._wake.clear()
-            changed, self._changed = self._changed, set()
             pause = asyncio.create_task(asyncio.sleep(PAUSE_SECONDS))
             with self._refusing("cannot reload"):
-                await self._reload(changed)
+                await self._reload_saved()
             await pause
+
+    async def _reload_saved(self) -> None:
+        async with self._lock:
+            if self._wake.is_set():  # else hot reload was switched off in the meantime
+                self._wake.clear()
+                changed, self._changed = self._changed, set()
+                await self._reload(changed)
 
     @contextlib.contextmanager
     def _refusing(self, what: str) -> Iterator[None]:
@@ -187,31 +192,33 @@ class Reloader:
             self._run.pipes.write_event("reload-failed", reason=error.message + hint)
 
     async def _reload(self, changed: Collection[str], node: str = "") -> list[str]:
-        """Apply the changed files, and reload `node` in any case; return what was done."""
-        async with self._lock:
-            run, current = self._run, self.current
-            if run is None or current is None:
-                hint = "wait until it has started"
-                raise DoraSystemdError("cannot reload: no node runs", hint, ExitCode.NOT_RUNNING)
-            moved = await asyncio.to_thread(self._moved)
-            if moved is not None:
-                return await self._follow_link(run, moved)
-            taken = Versions()
-            for path in {self.options.dataflow, self._settings.path}.intersection(changed):
-                taken.take(path, [path])
-            done = await self._take_settings(run) if self._settings.path in changed else []
-            changed = [path for path in changed if path != self._settings.path]
-            try:
-                look = self._sources.look
-                change = await asyncio.to_thread(look, current, changed, self._versions)
-            except DoraSystemdError:
-                self._changed |= set(changed)  # the next change may be what was missing
-                raise
-            change = change.with_node(node, self.options.dataflow) if node else change
-            if change.steps or change.whole:
-                run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
-                done += await self._apply(run, change)
-            self._versions.merge(taken)
+        """Apply the changed files, and reload `node` in any case; return what was done.
+
+        The caller holds the lock.
+        """
+        run, current = self._run, self.current
+        if run is None or current is None:
+            hint = "wait until it has started"
+            raise DoraSystemdError("cannot reload: no node runs", hint, ExitCode.NOT_RUNNING)
+        moved = await asyncio.to_thread(self._moved)
+        if moved is not None:
+            return await self._follow_link(run, moved)
+        taken = Versions()
+        for path in {self.options.dataflow, self._settings.path}.intersection(changed):
+            taken.take(path, [path])
+        done = await self._take_settings(run) if self._settings.path in changed else []
+        changed = [path for path in changed if path != self._settings.path]
+        try:
+            look = self._sources.look
+            change = await asyncio.to_thread(look, current, changed, self._versions)
+        except DoraSystemdError:
+            self._changed |= set(changed)  # the next change may be what was missing
+            raise
+        change = change.with_node(node, self.options.dataflow) if node else change
+        if change.steps or change.whole:
+            run.pipes.write_event("files-changed", files=", ".join(change.names(changed)))
+            done += await self._apply(run, change)
+        self._versions.merge(taken)
         self.notice = ""
         if self._run is not None and (done or self._run.pump.cell.notice):
             fed = downstream_of(change.prepared.dataflow)
@@ -306,7 +313,7 @@ class Reloader:
             raise DoraSystemdError(f"cannot use {change.prepared.dataflow.source}: {failure}")
         took = f"{time.monotonic() - begun:.2f}s"
         text = f"{reason}; ready after {took}"
-        run.pipes.write_event("reloaded", reason=text, file=", ".join(_files(change)))
+        run.pipes.write_event("reloaded", reason=text, file=", ".join(change.program_files()))
         return [f"the dataflow was reloaded: {text}"]
 
     async def answer(self, request: Mapping[str, Any]) -> Answer:
@@ -325,7 +332,8 @@ class Reloader:
         node = str(request.get("node") or "")
         changed = [] if node else await asyncio.to_thread(self._changed_since)
         try:
-            return {"done": await self._reload(changed, node)}
+            async with self._lock:
+                return {"done": await self._reload(changed, node)}
         except DoraSystemdError as error:
             self._refuse(error)
             raise
@@ -355,6 +363,9 @@ class Reloader:
             self._watcher.watch(self.options if is_on else None)
             if is_on:
                 await asyncio.to_thread(self._note_imports)
+            else:  # a save that waits for its turn is reloaded neither, as the answer promises
+                self._wake.clear()
+                self._changed.clear()
             # What is saved after the answer counts.
             await self._watcher.wait_seeing()
         return {"done": []}
@@ -383,13 +394,3 @@ def _place(options: RunnerOptions) -> tuple[str, str]:
 def _at(options: RunnerOptions, place: RunnerOptions) -> RunnerOptions:
     dataflow, directory = _place(place)
     return options._replace(dataflow=dataflow, working_directory=directory)
-
-
-def _files(change: Change) -> list[str]:
-    return list(dict.fromkeys(step.file for step in change.steps))
-
-
-def _names(change: Change, changed: Collection[str]) -> list[str]:
-    """Return the names of the files that matter; of all changed files for a whole reload."""
-    found = _files(change) if change.steps else sorted(changed)
-    return [PurePath(path).name for path in found]

@@ -91,6 +91,15 @@ class Change(NamedTuple):
     operators: Mapping[str, Mapping[str, str]] = {}
     files: Mapping[str, frozenset[str]] = {}  # of the programs, by node
 
+    def program_files(self) -> list[str]:
+        """The files of the steps, each once."""
+        return list(dict.fromkeys(step.file for step in self.steps))
+
+    def names(self, changed: Collection[str]) -> list[str]:
+        """The names of the files that matter; of all `changed` files for a whole reload."""
+        found = self.program_files() if self.steps else sorted(changed)
+        return [PurePath(path).name for path in found]
+
     def with_node(self, node: str, dataflow: str) -> "Change":
         """The change, with a reload of `node` added if it is missing. Raises DoraSystemdError."""
         if any(step.node == node for step in self.steps):

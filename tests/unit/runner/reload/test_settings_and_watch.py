@@ -153,6 +153,30 @@ def test_hot_reload_takes_over_nothing_by_being_switched_on(tmp_path: Path) -> N
     live(work)
 
 
+def test_a_save_that_waits_is_not_reloaded_once_hot_reload_is_off(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.begin()
+        (bench.root / "a.py").write_text("saved")
+        saved = [str(bench.root / "a.py")]
+
+        async def check(_: asyncio.Task[None]) -> None:
+            async with bench.reloader._lock:  # of the reload before
+                request = {"verb": "hot-reload", "on": False}
+                off = asyncio.create_task(bench.reloader.answer(request))
+                await asyncio.sleep(0)
+                bench.reloader._take_files(frozenset(saved))
+                await asyncio.sleep(0)
+            await off
+            async with bench.reloader._lock:  # whoever waited for the lock has had it
+                assert not bench.events
+            assert bench.reloader._changed_since() == saved, "reload will find it"
+
+        await at_work(bench, check)
+
+    live(work)
+
+
 def test_limits_of_lines(tmp_path: Path) -> None:
     """They hold for the nodes that run, for those that a reload adds, and for the next run."""
     rates = {"": parse_rate("9/1s"), "a": None}
