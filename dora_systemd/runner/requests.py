@@ -13,6 +13,7 @@ A node with readers is only removed if it has no launcher of ours.
 
 import asyncio
 import contextlib
+import os
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -46,6 +47,7 @@ from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.sources import Sources, check_programs
 from dora_systemd.runner.reload.swap import Target, of_node
+from dora_systemd.trust.programs import require_user
 from dora_systemd.values import SECOND, quoted
 
 
@@ -305,6 +307,7 @@ class Recheck:
 
     def _check(self) -> None:
         role, options = self._role, self._role.options
+        require_user(os.geteuid(), self._environment.get("USER", ""))
         _, prepared = check_start(options, role.own(options), self._environment)
         role.check(prepared.dataflow)
         here = prepared._replace(dataflow=role.here(prepared.dataflow))

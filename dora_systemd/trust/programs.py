@@ -9,14 +9,15 @@
 import os
 import pwd
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.paths import reached, user_name
 from dora_systemd.values import shown
 
+_User = TypeVar("_User", int, str)
 DEFAULT_PATH = "/usr/local/bin:/usr/bin:/bin"
 _LANGUAGE = "C.UTF-8"
 _FIRST_LINE = 256
@@ -49,6 +50,24 @@ def account_of_uid(uid: int) -> Account:
         hint = "the user was deleted while the dataflow ran: stop it, or make that user again"
         message = f"cannot become the user with the uid {uid}: there is none"
         raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND) from error
+
+
+def require_user(uid: int, name: str) -> None:
+    """Raise DoraSystemdError if a user was deleted, so that systemd starts nothing as that user.
+
+    name: in $USER, which --env can change; "" if User= is a number.
+    """
+    if name and not _is_known(uid, pwd.getpwuid) and not _is_known(name, pwd.getpwnam):
+        message = f"cannot start again as the user {shown(name)}: there is none any more"
+        raise DoraSystemdError(message, "create that user again", ExitCode.NOT_FOUND)
+
+
+def _is_known(user: _User, find: Callable[[_User], object]) -> bool:
+    try:
+        find(user)
+    except (KeyError, OverflowError):
+        return False
+    return True
 
 
 def own_account() -> Account:

@@ -16,11 +16,12 @@ from dora_systemd.trust.programs import (
     check_program,
     fresh_environment,
     own_account,
+    require_user,
     spawn,
 )
 
 root_only = pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
-NOBODY = 65534
+NOBODY, GONE = 65534, 3_999_999_999
 
 
 def script(path: Path, text: str = "#!/bin/sh\n", owner: int = 0) -> str:
@@ -92,6 +93,25 @@ def test_a_directory_of_others_is_enough(place: Path) -> None:
     os.chown(below, NOBODY, NOBODY)
     with pytest.raises(DoraSystemdError, match="nobody can change it"):
         check_program(program)
+
+
+@pytest.mark.parametrize(
+    ("uid", "name", "message"),
+    [
+        (NOBODY, "nobody", ""),
+        (NOBODY, "a-name-for-nodes", ""),
+        (GONE, "nobody", ""),
+        (GONE, "", ""),
+        (GONE, "robot-gone", "cannot start again as the user robot-gone: there is none any more"),
+    ],
+)
+def test_a_user_that_was_deleted(uid: int, name: str, message: str) -> None:
+    found = ""
+    try:
+        require_user(uid, name)
+    except DoraSystemdError as error:
+        found = error.message
+    assert found == message
 
 
 def test_the_own_account_needs_no_change() -> None:
