@@ -264,6 +264,7 @@ def test_a_bundle_has_the_messages_and_pictures(cell: Cell, project: Project) ->
     assert len(file.messages) > 40
     assert file.messages[0].topic == "camera/image"
     assert sum("images/camera-image/" in one and one.endswith(".png") for one in names) == 10
+    assert "requested by" in cell.doractl("why", "--bundle", str(bundle)).stdout
     cell.doractl("bundle", cell.name, "-o", str(bundle), "--no-journal")
     with tarfile.open(bundle) as archive:
         assert not [one for one in archive.getnames() if "recording" in one]

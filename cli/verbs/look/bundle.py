@@ -8,7 +8,8 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import check_readable
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import ExitCode, usage_error
+from dora_systemd.values import quoted
 from dora_systemd.verbs.bundles.write import write_bundle
 
 
@@ -31,9 +32,12 @@ def command(selector: str, file: str | None, no_journal: bool, images: bool) -> 
       doractl bundle robot --images
       doractl why --bundle robot.tar
     """
+    if file is not None and (file in ("", "-") or file.endswith("/")):
+        message = f"cannot write a bundle to {quoted(file)}: no path of a file"
+        raise usage_error(message, "doractl bundle NAME -o FILE")
     scope = current_scope()
     check_readable(scope)
-    place = Path(file).absolute() if file else None
+    place = None if file is None else Path(file).absolute()
     reach = partial(Bus, for_reading=True)
     done = write_bundle(reach, scope, selector, "doractl bundle", place, not no_journal, images)
     print_warnings(f"not in the bundle: {one}" for one in done.errors)

@@ -85,7 +85,8 @@ class Archive:
 
     def __init__(self, path: Path, most: int, at_us: int) -> None:
         self.path, self._most, self._at_us = path, most, at_us
-        self._partial = path.with_name(f".{path.name}.{os.urandom(4).hex()}{PARTIAL}")
+        # Not by the name of `path`, which can have as many bytes as a file system allows.
+        self._partial = path.with_name(f".bundle.{os.urandom(8).hex()}{PARTIAL}")
         self.parts: list[Part] = []
         self.errors: list[str] = []
 
@@ -115,17 +116,19 @@ class Archive:
         begin = self._file.tell()
         sink = _Bounded(self._file, max(self._most - begin - BLOCK - reserve, 0))
         try:
+            if section.name in {one.name for one in self.parts}:  # a ring can have a number twice
+                raise DoraSystemdError("there is one of that name")
             self._file.write(bytes(BLOCK))
             section.write(sink)
             self._file.write(bytes(-sink.size % BLOCK))
             self._file.flush()
+            os.pwrite(self._file.fileno(), self._header(section.name, sink.size), begin)
         except Exception as error:  # one part must not cost the others, whatever its defect is
             if isinstance(error, OSError) and error.errno in _FULL:
                 raise
             self._take_back(begin)
             self.errors.append(f"{section.name}: {_reason(error)}")
             return
-        os.pwrite(self._file.fileno(), self._header(section.name, sink.size), begin)
         self.parts.append(Part(section.name, sink.size, sink.digest.hexdigest()))
 
     def _take_back(self, begin: int) -> None:

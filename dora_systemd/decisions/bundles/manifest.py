@@ -5,8 +5,9 @@ A bundle without a manifest was cut. Whatever has another schema was written by 
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain, count
 from typing import Any, NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, bad_input
@@ -19,8 +20,11 @@ RULES = "allowlist 1: no values of variables, no arguments, settings or credenti
 
 README, WHY, MANIFEST, ERRORS = "README.txt", "why.json", "manifest.json", "errors.txt"
 MOST_MANIFEST = 1 << 20
-MOST_PARTS = 256
-_NAME = r"(?!\.)[A-Za-z0-9_.-]{1,200}(/(?!\.)[A-Za-z0-9_.-]{1,200})?"
+MOST_PARTS = 512
+MOST_LETTERS = 90
+"""Of a directory in the name of a part: the header of a tar file has no more room."""
+_DIRECTORY = rf"(?!\.)[A-Za-z0-9_.-]{{1,{MOST_LETTERS}}}/"
+_NAME = rf"({_DIRECTORY}){{0,2}}(?!\.)[A-Za-z0-9_.-]{{1,100}}"
 _DIGEST = r"[0-9a-f]{64}"
 
 
@@ -56,6 +60,21 @@ class Manifest:
 def is_part_name(name: str) -> bool:
     """Whether it can be the name of a file in a bundle: no path that leads out of a directory."""
     return re.fullmatch(_NAME, name) is not None
+
+
+def directory_names(texts: Iterable[str]) -> list[str]:
+    """For each text another name that a part can have for its directory."""
+    found: dict[str, None] = {}
+    for text in texts:
+        name = re.sub(r"[^A-Za-z0-9_.-]|^\.", "-", text)
+        begin = name[: MOST_LETTERS - 6]
+        names = chain([name] if 0 < len(name) <= MOST_LETTERS else [], _numbered(begin))
+        found[next(one for one in names if one not in found)] = None
+    return [*found]
+
+
+def _numbered(begin: str) -> Iterable[str]:
+    return (f"{begin}-{number}" for number in count(1))
 
 
 def format_manifest(one: Manifest) -> str:

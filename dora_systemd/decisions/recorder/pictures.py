@@ -9,7 +9,7 @@ import json
 import struct
 import zlib
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -17,6 +17,8 @@ from dora_systemd.decisions.recorder.reading import Recorded
 
 MOST_EACH = 10
 """Pictures of each output: the last ones."""
+_MOST = 256
+"""Pictures of many outputs, but one of each in any case."""
 MOST_PIXELS = 64 * 1024 * 1024
 MOST_METADATA = 64 * 1024
 _MOST_SEGMENTS = 1000
@@ -34,22 +36,23 @@ _LEVEL = 1
 class Picture(NamedTuple):
     """A file."""
 
-    name: str  # such as camera-image/000123.jpg
+    output: int  # its place among the outputs of the recorder
+    name: str  # such as 000123.jpg, by the number of the message
     data: bytes
 
 
-def find_pictures(messages: Iterable[Recorded], outputs: Sequence[str]) -> Iterator[Picture]:
+def find_pictures(messages: Iterable[Recorded]) -> Iterator[Picture]:
     """The last pictures of each output."""
     last: dict[int, deque[Recorded]] = {}
     for one in messages:
         if is_picture(one.meta):
             last.setdefault(one.output, deque(maxlen=MOST_EACH)).append(one)
+    most = max(_MOST // len(last), 1) if last else 0
     for output, found in last.items():
-        for one in found:
+        for one in [*found][-most:]:
             if picture := picture_of(one):
                 ending, data = picture
-                folder = "".join(c if c.isalnum() or c in "_." else "-" for c in outputs[output])
-                yield Picture(f"{folder}/{one.head.number:06}.{ending}", data)
+                yield Picture(output, f"{one.head.number:06}.{ending}", data)
 
 
 def is_picture(metadata: bytes) -> bool:

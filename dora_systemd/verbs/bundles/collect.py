@@ -25,7 +25,7 @@ from dora_systemd.decisions.bundles.allowlist import (
     kept_status,
     of_lives,
 )
-from dora_systemd.decisions.bundles.manifest import WHY
+from dora_systemd.decisions.bundles.manifest import WHY, directory_names
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.logs.query import bundle_matches, kernel_matches
 from dora_systemd.decisions.views.findings import Finding
@@ -88,8 +88,9 @@ def sections_of(what: Evidence) -> list[Section]:
         what.left_out.append("cgroup.json and nodes.json: the dataflow does not run")
     found.append(Section("doctor.json", lambda sink: _put_json(sink, _findings(what))))
     if what.report.stack and what.want_journal:
-        name = f"stacks/{what.report.verdict.node or 'node'}.txt"
-        found.append(Section(name, lambda sink: _put_lines(sink, map(str, what.report.stack))))
+        (name,) = directory_names([what.report.verdict.node or "node"])
+        stack = [*map(str, what.report.stack)]
+        found.append(Section(f"stacks/{name}.txt", lambda sink: _put_lines(sink, stack)))
     return [*found, *_recording(what)]
 
 

@@ -8,6 +8,7 @@ from functools import partial
 from dora_systemd.adapters.bundles.store import Section, Sink
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.bundles.manifest import directory_names
 from dora_systemd.decisions.recorder.mcap import write_recording
 from dora_systemd.decisions.recorder.pictures import Picture, find_pictures
 from dora_systemd.decisions.recorder.reading import Reading
@@ -35,7 +36,11 @@ def sections(ring: RingFile | None, left_out: list[str], want_pictures: bool) ->
         left_out.append(f"{RECORDING}: nothing was recorded")
         return []
     pictures = _pictures(ring) if want_pictures else []
-    own = [Section(f"images/{one.name}", partial(_put_picture, one)) for one in pictures]
+    of_outputs = directory_names(ring.header.outputs)
+    own = [
+        Section(f"images/{of_outputs[one.output]}/{one.name}", partial(_put_picture, one))
+        for one in pictures
+    ]
     return [Section(RECORDING, partial(_put, ring, left_out)), *own]
 
 
@@ -86,7 +91,7 @@ def _pictures(ring: RingFile) -> list[Picture]:
         reading = Reading(ring, ring.size, _MOST_BYTES)
     except ValueError:  # the user of the nodes has written to it: errors.txt has the reason
         return []
-    return list(find_pictures(reading.messages(), reading.header.outputs))
+    return list(find_pictures(reading.messages()))
 
 
 def _put_picture(picture: Picture, sink: Sink) -> None:

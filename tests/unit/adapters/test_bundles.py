@@ -92,6 +92,18 @@ def test_a_section_that_fails_costs_no_other(tmp_path: Path) -> None:
         assert [one.name for one in found.manifest.parts] == ["README.txt", "why.json", "c"]
 
 
+def test_a_name_that_a_bundle_cannot_have_costs_no_other(tmp_path: Path) -> None:
+    path = tmp_path / f"{'x' * 251}.tar"
+    archive = write(path, section("y" * 200, b"y"), section("c", b"c"), section("c", b"d"))
+    assert archive.errors == [
+        f"{'y' * 200}: ValueError: name is too long",
+        "c: there is one of that name",
+    ]
+    with opened(path) as found:
+        found.check()
+        assert [one.name for one in found.manifest.parts] == ["README.txt", "why.json", "c"]
+
+
 def full(_sink: Sink) -> None:
     raise OSError(errno.ENOSPC, "no space")
 
@@ -158,7 +170,7 @@ def foreign(kind: bytes, name: str = "README.txt") -> bytes:
         foreign(tarfile.REGTYPE) + foreign(tarfile.LNKTYPE, "why.json"),
         foreign(tarfile.REGTYPE) * 2,
         foreign(tarfile.REGTYPE) + foreign(tarfile.GNUTYPE_SPARSE, "why.json"),
-        foreign(tarfile.REGTYPE) + b"".join(foreign(tarfile.REGTYPE, f"x{n}") for n in range(300)),
+        foreign(tarfile.REGTYPE) + b"".join(foreign(tarfile.REGTYPE, f"x{n}") for n in range(600)),
     ],
 )
 def test_foreign_files(tmp_path: Path, data: bytes) -> None:

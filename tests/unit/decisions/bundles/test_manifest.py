@@ -5,12 +5,16 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dora_systemd.decisions.bundles.manifest import (
+    MOST_LETTERS,
     MOST_PARTS,
     SCHEMA,
     Manifest,
     Part,
+    directory_names,
     format_manifest,
     is_part_name,
     parse_manifest,
@@ -73,10 +77,31 @@ def test_wrong_values(key: str, value: Any) -> None:
 
 
 def test_names_of_parts() -> None:
-    for name in ("README.txt", "stacks/camera-1.txt", "recording.mcap"):
+    for name in (
+        "README.txt",
+        "stacks/camera-1.txt",
+        "recording.mcap",
+        "images/camera-image/1.png",
+    ):
         assert is_part_name(name)
-    for name in ("", "/etc/x", "../x", "a/../b", ".hidden", "a/b/c", "a\nb", "a/", "ü", "x" * 300):
+    for name in ("", "/etc/x", "../x", "a/../b", ".hidden", "a/.b/c", "a/b/c/d", "a\nb", "a/"):
         assert not is_part_name(name)
+    for name in ("ü", "x" * 101, f"{'x' * 91}/y"):
+        assert not is_part_name(name)
+
+
+@given(st.lists(st.text(max_size=120), max_size=20))
+def test_names_of_directories(texts: list[str]) -> None:
+    names = directory_names(texts)
+    assert len(names) == len(texts) == len({*names})
+    assert all(is_part_name(f"images/{name}/1.png") for name in names)
+    again = [name for name in names if len(name) <= MOST_LETTERS]
+    assert directory_names(again) == again == names
+
+
+def test_a_directory_has_the_name_of_what_is_in_it() -> None:
+    found = directory_names(["camera/image", "camera-image", ".x", "", "ü", "x" * 99])
+    assert found == ["camera-image", "camera-image-1", "-x", "-1", "-", "x" * 84 + "-1"]
 
 
 def test_the_readme_announces_what_nodes_have_written() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.decisions.bundles.manifest import is_part_name
 from dora_systemd.decisions.recorder.record import Record
 from dora_systemd.decisions.recorder.ring import ALIGN
 from dora_systemd.decisions.recorder.writer import Writer
@@ -67,6 +68,7 @@ def test_the_messages_and_their_pictures(ring: int) -> None:
     del ring
     parts, left_out = written(want_pictures=True)
     assert list(parts) == ["recording.mcap", "images/camera-image/000001.png"]
+    assert all(map(is_part_name, parts))
     file = File(parts["recording.mcap"])
     assert [one.topic for one in file.messages] == ["camera/image", "camera/image#metadata"]
     assert parts["images/camera-image/000001.png"].startswith(b"\x89PNG")
