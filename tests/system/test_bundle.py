@@ -146,6 +146,23 @@ def test_no_bundle_has_a_planted_secret(cell: Cell, project: Project) -> None:
     assert not any(secret.encode() in b"\n".join(without.values()) for secret in SECRETS.values())
 
 
+PRIVATE = ("nodes.json", "recording.mcap")
+REFUSED = "only root and the user of the dataflow may read it"
+
+
+def of_another_user(cell: Cell) -> dict[str, bytes]:
+    """The files of a bundle that a user writes who may only read the journal."""
+    path = Path(f"/tmp/{cell.name}.tar")
+    user = ("setpriv", "--reuid=alice", "--regid=alice", "--groups=systemd-journal")
+    said = run(*user, "doractl", "--system", "bundle", cell.name, "-o", str(path))
+    try:
+        assert said.stdout == f"{path}\n"
+        assert all(f"not in the bundle: {one}: {REFUSED}" in said.stderr for one in PRIVATE)
+        return texts(path)
+    finally:
+        path.unlink()
+
+
 @pytest.mark.warns(*CRASHES)
 def test_what_a_bundle_has(cell: Cell, project: Project, bundles: Path) -> None:
     cell.start(project.three_nodes())
@@ -176,6 +193,9 @@ def test_what_a_bundle_has(cell: Cell, project: Project, bundles: Path) -> None:
         file = str(project.root / "read.journal")
         run(str(remote), "-o", file, str(project.root / "journal.export"))
         assert "got [" in run("journalctl", "--file", file, "-o", "cat").stdout
+    lacking = of_another_user(cell)
+    assert {*found} - {*lacking} == {"nodes.json"}
+    assert lacking["errors.txt"].decode().splitlines() == [f"{one}: {REFUSED}" for one in PRIVATE]
     copied = str(shutil.copy(path, project.root / "copied.tar"))
     said = run("runuser", "-u", "alice", "--", "doractl", "why", "--bundle", copied, check=False)
     assert said.returncode == ExitCode.BAD_INPUT  # it is root's

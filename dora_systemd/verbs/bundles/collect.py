@@ -1,11 +1,12 @@
 """The sections of a bundle: what each file of it has, by the lists of decisions/bundles/."""
 
 import json
+import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from dora_systemd.adapters.bundles.store import Section, Sink
 from dora_systemd.adapters.bus.manager import Manager
@@ -33,6 +34,7 @@ from dora_systemd.decisions.views.objects import format_json
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.lives import plain_text
 from dora_systemd.decisions.why.report import Report, report_object
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_table
 from dora_systemd.trust.rings import RingFile
@@ -63,6 +65,11 @@ class Evidence:
     ring: RingFile | None = None  # the ring, if it was opened when the failure was seen
     # what is not in the bundle, and why; a section may add to it while it is written
     left_out: list[str] = field(default_factory=list)
+
+    @property
+    def may_read_all(self) -> bool:
+        """Whether no permission is missing: the nodes' user and root may read all."""
+        return self.scope.is_user or os.geteuid() == 0
 
     @property
     def is_up(self) -> bool:
@@ -104,6 +111,8 @@ def _recording(what: Evidence) -> list[Section]:
         return []
     uuid = what.report.subject.uuid
     ring = what.ring or recording.find(what.manager, what.scope, what.cell, uuid)
+    if ring is None and what.cell is not None and not what.may_read_all:
+        return [Section(recording.RECORDING, _refuse)]
     return recording.sections(ring, what.left_out, what.want_pictures)
 
 
@@ -138,7 +147,7 @@ def _groups(what: Evidence) -> dict[str, Any]:
 
 
 def _node_numbers(path: Path, what: Evidence) -> dict[str, Any]:
-    groups = cgroup.shown_groups(path, _status(what).nodes)
+    groups = cgroup.shown_groups(path, (_status(what) or CellStatus()).nodes)
     return {node: _numbers(one) for node, one in groups.items()}
 
 
@@ -148,13 +157,20 @@ def _numbers(path: Path) -> dict[str, Any]:
     return {**usage, **strain, "memory_stat": stat, "populated": cgroup.is_populated(path)}
 
 
-def _status(what: Evidence) -> CellStatus:
+def _status(what: Evidence) -> CellStatus | None:
     assert what.cell is not None
-    return read_table(what.scope.cell_directory(what.cell.name)) or CellStatus()
+    return read_table(what.scope.cell_directory(what.cell.name))
 
 
 def _nodes(what: Evidence) -> dict[str, Any]:
-    return kept_status(_status(what))
+    status = _status(what)
+    if status is None and not what.may_read_all:
+        _refuse()
+    return kept_status(status or CellStatus())
+
+
+def _refuse(*_: Sink) -> NoReturn:
+    raise DoraSystemdError("only root and the user of the dataflow may read it")
 
 
 def _findings(what: Evidence) -> Sequence[Mapping[str, Any]]:
