@@ -30,6 +30,7 @@ MOST_META = 16 * 1024
 PAUSE_NS = 100_000_000
 """Between two reads of what dora has printed."""
 KILLED_FIRST = "1000"
+NICE = 10
 EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)  # noqa: UP017 - for Python 3.9
 MICROSECOND = datetime.timedelta(microseconds=1)
 to_json = json.JSONEncoder(default=str).encode
@@ -98,16 +99,29 @@ def be_killed_first() -> None:
         file.write(KILLED_FIRST)
 
 
-def give_way() -> None:
+def has_weight(own: str = "/proc/self/cgroup", groups: str = "/sys/fs/cgroup") -> bool:
+    """Whether the cgroup of this process has a share of the CPU time, see cpu.weight."""
+    with suppress(OSError), open(own) as file:  # noqa: PTH123
+        if found := re.search("^0::(.*)", file.read(), re.MULTILINE):
+            return os.path.exists(f"{groups}{found[1]}/cpu.weight")  # noqa: PTH110
+    return False
+
+
+def give_way(is_idle: bool) -> None:
     """Take the CPU time that nobody needs, with all threads; later ones inherit it.
 
-    Not before the imports: where all CPU time is used, these would take minutes.
+    Not before the imports: where all CPU time is used, these would take minutes. is_idle: by
+    SCHED_IDLE, else by NICE. Without a weight, busy nodes leave nothing to an idle process.
     """
     done: set[str] = set()
     while new := {*os.listdir("/proc/self/task")} - done:  # noqa: PTH208 - without pathlib
-        for thread in new:
+        for thread in map(int, new):
             with suppress(OSError):
-                os.sched_setscheduler(int(thread), os.SCHED_IDLE, os.sched_param(0))
+                if is_idle:
+                    os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
+                else:
+                    nice = max(os.getpriority(os.PRIO_PROCESS, thread), NICE)
+                    os.setpriority(os.PRIO_PROCESS, thread, nice)
         done |= new
 
 
@@ -197,7 +211,7 @@ def main(path: str, package: str) -> None:
     from dora import Node
 
     node = Node()
-    give_way()
+    give_way(has_weight())
     record(node, Recorder(writer, ring, pyarrow, drops))
 
 

@@ -8,10 +8,13 @@ import sys
 import threading
 from pathlib import Path
 
+import pytest
+
 import dora_systemd
 from dora_systemd.decisions.recorder.reading import Reading, Recorded
 from dora_systemd.decisions.recorder.record import Record
 from dora_systemd.runner.recorder.keep import RingSocket, fitted_ring, header_of
+from dora_systemd.runner.recorder.record import NICE, has_weight
 
 PACKAGE = Path(dora_systemd.__file__).parent
 SCRIPT = PACKAGE / "runner" / "recorder" / "record.py"
@@ -139,8 +142,33 @@ def test_what_dora_drops_is_counted(tmp_path: Path) -> None:
 def test_all_threads_give_way_once_it_is_connected(tmp_path: Path) -> None:
     metadata = '{"before": BEFORE, "now": policies()}'
     (message,), _ = recorded(tmp_path, f"lambda: {event(0, b'x', metadata=metadata)}", STOP)
-    usual, idle = os.sched_getscheduler(0), os.SCHED_IDLE
-    assert json.loads(message.meta) == {"before": [usual], "now": [idle, idle]}
+    usual = os.sched_getscheduler(0)
+    now = os.SCHED_IDLE if has_weight() else usual
+    assert json.loads(message.meta) == {"before": [usual], "now": [now, now]}
+
+
+@pytest.mark.parametrize("is_idle", [True, False])
+def test_a_process_without_a_weight_is_not_idle(is_idle: bool) -> None:
+    names = "dora_systemd.runner.recorder.record import NICE, give_way"
+    now = "os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)"
+    code = f"import os\nfrom {names}\ngive_way({is_idle})\nprint({now}, NICE)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    usual, nice = os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)
+    given = (os.SCHED_IDLE, nice) if is_idle else (usual, max(nice, NICE))
+    assert done.stdout == f"{given[0]} {given[1]} {NICE}\n"
+
+
+def test_a_weight_is_that_of_the_own_cgroup(tmp_path: Path) -> None:
+    own, groups = tmp_path / "cgroup", tmp_path / "groups"
+    assert not has_weight(str(own), str(groups))
+    (groups / "a/b").mkdir(parents=True)
+    (groups / "a/cpu.weight").touch()
+    for text, expected in (
+        *(("0::/a/b\n", False), ("0::/a\n", True), ("5:cpu:/a\n", False)),
+        ("5:cpu:/x\n0::/a\n", True),
+    ):
+        own.write_text(text)
+        assert has_weight(str(own), str(groups)) == expected, text
 
 
 def test_it_ends_with_an_input(tmp_path: Path) -> None:
