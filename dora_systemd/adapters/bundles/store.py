@@ -10,6 +10,7 @@ import json
 import os
 import re
 import stat
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -314,12 +315,12 @@ def locked(store: BundleStore) -> Iterator[None]:
 def room(directory: Path) -> int:
     """Bytes that a bundle may take: the disk keeps 15 %, or 1 GiB if that is less.
 
-    Raises DoraSystemdError if that is nearly nothing.
+    All bytes, if the file system reports no size. Raises OSError, and DoraSystemdError if nearly
+    none are left.
     """
-    try:
-        found = os.statvfs(directory)
-    except OSError as error:
-        raise unusable(directory, error) from error
+    found = os.statvfs(directory)
+    if not found.f_blocks:
+        return sys.maxsize
     keep = min(found.f_blocks * found.f_frsize * _PERCENT // 100, _GIB)
     left = found.f_bavail * found.f_frsize - keep
     if left < LEAST:
@@ -332,12 +333,20 @@ def room(directory: Path) -> int:
 _PLACE_HINTS = {
     errno.ENOENT: "create that directory first, or name a file in another one",
     errno.ENOTDIR: "name a file in a directory",
+    errno.ENAMETOOLONG: "name a file with a shorter name",
 }
 
 
-def place_hint(error: OSError) -> str:
-    """Return what to do about a place where no bundle can be written."""
-    return _PLACE_HINTS.get(error.errno or 0, "see df")
+def unwritable(path: Path, error: OSError) -> DoraSystemdError:
+    """The error for a place where no bundle can be written."""
+    message = f"cannot write a bundle to {shown(str(path))}: {error.strerror}"
+    elsewhere = "-o FILE in a directory of your own"
+    if isinstance(error, PermissionError):
+        hint = elsewhere if os.geteuid() == 0 else f"use sudo, or {elsewhere}"
+        return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
+    if hint := _PLACE_HINTS.get(error.errno or 0, ""):
+        return bad_input(message, hint)
+    return DoraSystemdError(message, elsewhere if error.errno == errno.EROFS else "see df")
 
 
 def require_replaceable(path: Path) -> None:
@@ -358,6 +367,6 @@ def require_replaceable(path: Path) -> None:
 def unusable(path: Path, error: OSError) -> DoraSystemdError:
     """The error for a store that cannot be used."""
     is_refused = isinstance(error, PermissionError)
-    hint = "use sudo, or -o FILE" if is_refused else place_hint(error)
+    hint = "use sudo, or -o FILE" if is_refused else "see df"
     code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
     return DoraSystemdError(f"cannot use {shown(str(path))}: {error.strerror}", hint, code)

@@ -1,6 +1,5 @@
 """`doractl bundle`: writes a bundle to a file, or to the store of the dataflow."""
 
-import errno
 import os
 import platform
 import time
@@ -23,9 +22,9 @@ from dora_systemd.adapters.bundles.store import (
     Sink,
     Stored,
     locked,
-    place_hint,
     require_replaceable,
     room,
+    unwritable,
 )
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.note import note_request, requester
@@ -44,10 +43,9 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.logs.journal_events import BUNDLE_REFUSED, BUNDLE_WRITTEN
 from dora_systemd.decisions.notice.happened import POWER_LOST, Happened
 from dora_systemd.decisions.why.report import format_report
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.rings import RingFile
-from dora_systemd.values import shown
 from dora_systemd.verbs.bundles.collect import Evidence, sections_of
 from dora_systemd.verbs.doctor import examine
 from dora_systemd.verbs.facts.cells import Cell, read_cell
@@ -277,9 +275,4 @@ def _explained(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        is_refused = isinstance(error, PermissionError)
-        code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
-        can_move = is_refused or error.errno == errno.EROFS
-        hint = "use sudo, or -o FILE in a directory of your own" if can_move else place_hint(error)
-        message = f"cannot write a bundle to {shown(str(path))}: {error.strerror}"
-        raise DoraSystemdError(message, hint, code) from error
+        raise unwritable(path, error) from error

@@ -20,6 +20,7 @@ from dora_systemd.adapters.bundles.store import (
     Sink,
     locked,
     room,
+    unwritable,
 )
 from dora_systemd.decisions.bundles.manifest import MANIFEST, Manifest, format_manifest
 from dora_systemd.decisions.views.rows import Bundles, format_bundles
@@ -254,6 +255,28 @@ def test_a_bundle_leaves_some_of_the_disk(disk: list[int], tmp_path: Path) -> No
     with pytest.raises(DoraSystemdError, match="only 150M of the disk free") as caught:
         room(tmp_path)
     assert caught.value.hint == "a bundle leaves 150M free; see df"
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "hint"),
+    [
+        (errno.ENOENT, ExitCode.BAD_INPUT, "create that directory first"),
+        (errno.ENOTDIR, ExitCode.BAD_INPUT, "name a file in a directory"),
+        (errno.ENAMETOOLONG, ExitCode.BAD_INPUT, "name a file with a shorter name"),
+        (errno.EROFS, ExitCode.FAILURE, "-o FILE in a directory of your own"),
+        (errno.ENOSPC, ExitCode.FAILURE, "see df"),
+        (errno.EACCES, ExitCode.NO_PERMISSION, "-o FILE" if os.geteuid() == 0 else "use sudo, or"),
+    ],
+)
+def test_what_to_do_where_none_can_be_written(number: int, code: ExitCode, hint: str) -> None:
+    found = unwritable(Path("/x/y.tar"), OSError(number, os.strerror(number)))
+    assert found.message == f"cannot write a bundle to /x/y.tar: {os.strerror(number)}"
+    assert found.code is code
+    assert found.hint.startswith(hint)
+
+
+def test_a_file_system_that_reports_no_size_has_room() -> None:
+    assert room(Path("/proc")) > 1 << 40
 
 
 def test_what_cannot_be_used(tmp_path: Path) -> None:

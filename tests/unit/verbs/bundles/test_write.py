@@ -87,9 +87,9 @@ def test_another_place(reach: Reach, scope: ScopeIn, tmp_path: Path) -> None:
         assert "journal.export.gz" not in [one.name for one in bundle.manifest.parts]
         assert bundle.manifest.left_out[0].endswith("--no-journal")
     assert kept_names(scope) == []
-    with pytest.raises(DoraSystemdError, match="No such file") as caught:
+    with pytest.raises(DoraSystemdError, match=r"a/b\.tar: No such file") as caught:
         write_bundle(reach, scope, "robot", "x", tmp_path / "a/b.tar")
-    assert caught.value.code is ExitCode.FAILURE
+    assert caught.value.code is ExitCode.BAD_INPUT
     assert caught.value.hint.startswith("create that directory first")
     with pytest.raises(DoraSystemdError, match="it is a directory") as caught:
         write_bundle(reach, scope, "robot", "x", tmp_path)
