@@ -135,6 +135,18 @@ def test_a_killed_runner(cell: Cell, project: Project) -> None:
     assert lines(text)["CAUSE"] == "the supervisor process was killed (SIGKILL)"
 
 
+@pytest.mark.warns("killed", "SIGKILL", "Failed with", "failed: ")
+def test_a_kill_that_was_requested(cell: Cell, project: Project) -> None:
+    """systemd calls the unit failed, and starts what sends notices and writes bundles."""
+    cell.start(flow(project), "--black-box", "keep=3,size=10M", *options(project))
+    cell.doractl("stop", "--now", cell.name)
+    ended = f"{notice_unit(cell.name)}: Deactivated successfully"
+    wait_for("its end", lambda: ended in journalctl("-u", notice_unit(cell.name)))
+    assert (
+        notices(project) == recorded(cell, "notice-sent") == recorded(cell, "bundle-written") == []
+    )
+
+
 @pytest.fixture
 def late(project: Project) -> Iterator[Path]:
     """The service that sends notices waits for this file before it reads anything."""

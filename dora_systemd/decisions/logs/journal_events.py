@@ -181,7 +181,7 @@ END_EVENTS = (*CLEAN_ENDS, "dataflow-failed")
 NODE_FAILURES = ("node-crashed", "node-ended", "node-oom")
 NODE_END_EVENTS = ("node-exited", *NODE_FAILURES)
 
-START_ASKED = "start-asked"
+START_ASKED, STOP_ASKED = "start-asked", "stop-asked"
 ROLLED_BACK = "release-rolled-back"
 BUILD_FAILED = "build-failed"
 FORGOTTEN = "dataflow-forgotten"
@@ -189,7 +189,7 @@ GIVEN_UP, NOTICE_SENT, NOTICE_FAILED = "node-given-up", "notice-sent", "notice-f
 BUNDLE_WRITTEN, BUNDLE_REFUSED = "bundle-written", "bundle-refused"
 NOTICE_ENDS = (NOTICE_SENT, NOTICE_FAILED, BUNDLE_WRITTEN, BUNDLE_REFUSED)
 """What follows a failure. With DORA_UNTIL it names the newest failure that it is about."""
-REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK, BUILD_FAILED)
+REQUESTS = (STOP_ASKED, "release-committed", ROLLED_BACK, BUILD_FAILED)
 """What doractl writes about a dataflow, outside of its unit."""
 
 # Details for the text only: the origin of the record has the fields for them.

@@ -18,6 +18,7 @@ from dora_systemd.decisions.logs.journal_events import (
     ROLLED_BACK,
     STARTED,
     STARTING,
+    STOP_ASKED,
     STOPPING,
 )
 from dora_systemd.errors import usage_error
@@ -39,6 +40,9 @@ UNIT_FAILED = "d9b373ed55a64feb8242e02dbe79a49c"
 """MESSAGE_ID of systemd's record when a unit has failed."""
 
 UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", UNIT_FAILED)
+PROCESS_EXITED = "98e322203f7a4ed290d09fe03c09fe15"
+"""MESSAGE_ID of systemd's record when the main process of a unit has ended."""
+
 UNIT_RESTART = "5eb03494b6584870a536b337290809b3"
 """MESSAGE_ID of systemd's record when it restarts a unit automatically."""
 
@@ -211,8 +215,9 @@ def kernel_matches() -> list[str]:
 def notice_matches(scope: Scope, name: str) -> list[str]:
     """Matches for all that a notice reports, and for the notices that were sent."""
     events = [f"DORA_EVENT={one}" for one in ("dataflow-failed", "machine-lost", GIVEN_UP)]
-    asked = _asked_matches(scope, ROLLED_BACK, *NOTICE_ENDS)
-    failures = [*_systemd_matches(scope, name), f"MESSAGE_ID={UNIT_FAILED}"]
+    asked = _asked_matches(scope, ROLLED_BACK, STOP_ASKED, *NOTICE_ENDS)
+    ids = [f"MESSAGE_ID={one}" for one in (UNIT_STARTING, PROCESS_EXITED, UNIT_FAILED)]
+    failures = [*_systemd_matches(scope, name), *ids]
     own = [*scope_matches(scope, name), *events]
     return [*own, "+", *failures, "+", *asked, f"DORA_DATAFLOW_NAME={name}"]
 

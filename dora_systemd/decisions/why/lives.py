@@ -11,7 +11,12 @@ from typing import Any
 
 from dora_systemd.decisions.cell.status import STOP
 from dora_systemd.decisions.logs.journal_events import REQUESTS
-from dora_systemd.decisions.logs.query import UNIT_FAILED, UNIT_RESTART, UNIT_STARTING
+from dora_systemd.decisions.logs.query import (
+    PROCESS_EXITED,
+    UNIT_FAILED,
+    UNIT_RESTART,
+    UNIT_STARTING,
+)
 from dora_systemd.decisions.views.facts import NodeRow
 
 # https://github.com/systemd/systemd/blob/main/src/systemd/sd-messages.h
@@ -22,7 +27,7 @@ UNIT_MESSAGES = {
     "9d1aaa27d60140bd96365438aad20286": "unit-stopped",
     "7ad2d189f7e94e70a38c781354912448": "unit-succeeded",
     UNIT_FAILED: "unit-failed",
-    "98e322203f7a4ed290d09fe03c09fe15": "process-exited",
+    PROCESS_EXITED: "process-exited",
     UNIT_RESTART: "unit-restart",
     "fe6faa94e7774663a0da52717891d8ef": "unit-oom",
 }

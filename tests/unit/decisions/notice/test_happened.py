@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.environment import checked_variable
 from dora_systemd.decisions.cell.environment_file import parse_environment_file
-from dora_systemd.decisions.logs.query import UNIT_FAILED
+from dora_systemd.decisions.life.causes import BY_SIGKILL
+from dora_systemd.decisions.logs.query import PROCESS_EXITED, UNIT_FAILED, UNIT_STARTING
 from dora_systemd.decisions.notice.happened import (
     FIRST_PAUSE,
     LAST_PAUSE,
@@ -105,6 +106,42 @@ def test_a_bundle_of_a_failure_counts_as_a_notice_and_a_requested_one_does_not()
         assert found == []
         assert last
         assert last.mono_us == 998 * SECOND
+
+
+def killed(seconds: float, life: str, reason: str = BY_SIGKILL) -> list[dict[str, Any]]:
+    """What systemd and ExecStopPost= write about a life that SIGKILL has ended, newest first."""
+    exited = {"MESSAGE_ID": PROCESS_EXITED, "INVOCATION_ID": life}
+    return [
+        unit_failed(seconds, life),
+        {**failed(seconds, life, reason), "DORA_DATAFLOW": UUID},
+        record(seconds - 1, **exited),
+    ]
+
+
+def stop_asked(seconds: float, uuid: str = UUID) -> dict[str, Any]:
+    return record(seconds, DORA_EVENT="stop-asked", DORA_DATAFLOW=uuid)
+
+
+def unit_starting(seconds: float, life: str) -> dict[str, Any]:
+    return record(seconds, MESSAGE_ID=UNIT_STARTING, INVOCATION_ID=life)
+
+
+@pytest.mark.parametrize(
+    ("records", "lives"),
+    [
+        ([*killed(999, "2"), stop_asked(996), unit_starting(990, "2")], 0),
+        ([*killed(999, "2"), stop_asked(996)], 0),
+        ([*killed(999, "2"), unit_starting(997, "2"), stop_asked(996)], 1),
+        ([*killed(999, "2"), stop_asked(996, OTHER)], 1),
+        ([*killed(999, "2"), stop_asked(996, "")], 1),
+        ([*killed(999, "2", f"{BY_SIGKILL}, out of memory"), stop_asked(996)], 1),
+        ([*killed(999, "2")[:2], stop_asked(998.5), *killed(999, "2")[2:]], 1),
+        ([*killed(999, "2"), stop_asked(996), *killed(995, "1"), unit_starting(990, "1")], 1),
+        ([stop_asked(999.5), *killed(999, "1")], 1),
+    ],
+)
+def test_a_kill_that_was_requested_is_no_failure(records: list[dict[str, Any]], lives: int) -> None:
+    assert len(read_story(records, "b", NOW)[0]) == lives
 
 
 def test_a_failure_that_the_runner_could_not_record() -> None:
