@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from dora_systemd.adapters.releases.store import Store, is_locked
-from tests.system.cells import Project, run, wait_for
+from tests.system.cells import Project, journalctl, run, wait_for
 from tests.system.releases import STORE, Releases, write_version
 
 # They write to /etc and /var/lib.
@@ -76,6 +76,17 @@ def test_kill_9_of_a_whole_unit_leaves_a_trial_that_can_be_ended(
     assert "on trial" in releases.cell.doractl("doctor", check=False).stdout
     releases.cell.doractl("rollback", releases.cell.name)
     releases.check_only(good)
+
+
+@pytest.mark.warns("killed", "SIGKILL", "Failed with", "failed: ", "rolled back")
+@pytest.mark.usefixtures("job")
+def test_what_stop_now_has_ended_does_not_start_again(releases: Releases, good: str) -> None:
+    """Whoever stops a robot during a trial wants it to stand still."""
+    cell = releases.cell
+    cell.doractl("stop", "--now", cell.name)
+    wait_for("the way back", lambda: not is_at_work(releases))
+    assert (cell.show("ActiveState"), releases.current()) == ("inactive", good)
+    assert "it was stopped" in journalctl("-u", JOB)
 
 
 def test_killed_before_the_trial(releases: Releases, project: Project, good: str) -> None:

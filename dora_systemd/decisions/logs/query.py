@@ -215,11 +215,18 @@ def kernel_matches() -> list[str]:
 def notice_matches(scope: Scope, name: str) -> list[str]:
     """Matches for all that a notice reports, and for the notices that were sent."""
     events = [f"DORA_EVENT={one}" for one in ("dataflow-failed", "machine-lost", GIVEN_UP)]
-    asked = _asked_matches(scope, ROLLED_BACK, STOP_ASKED, *NOTICE_ENDS)
-    ids = [f"MESSAGE_ID={one}" for one in (UNIT_STARTING, PROCESS_EXITED, UNIT_FAILED)]
-    failures = [*_systemd_matches(scope, name), *ids]
+    asked = _asked_matches(scope, ROLLED_BACK, *NOTICE_ENDS)
+    failures = [*_systemd_matches(scope, name), f"MESSAGE_ID={UNIT_FAILED}"]
     own = [*scope_matches(scope, name), *events]
-    return [*own, "+", *failures, "+", *asked, f"DORA_DATAFLOW_NAME={name}"]
+    reported = [*own, "+", *failures, "+", *asked, f"DORA_DATAFLOW_NAME={name}"]
+    return [*reported, "+", *kill_matches(scope, name)]
+
+
+def kill_matches(scope: Scope, name: str) -> list[str]:
+    """Matches for ends of processes, for begins of lives, and for requests to stop."""
+    ids = [f"MESSAGE_ID={one}" for one in (UNIT_STARTING, PROCESS_EXITED)]
+    asked = [*_asked_matches(scope, STOP_ASKED), f"DORA_DATAFLOW_NAME={name}"]
+    return [*_systemd_matches(scope, name), *ids, "+", *asked]
 
 
 def sent_matches(scope: Scope, name: str) -> list[str]:

@@ -9,21 +9,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.life.causes import BY_SIGKILL
+from dora_systemd.decisions.life.kills import Kills, life_of
 from dora_systemd.decisions.logs.journal_events import (
     BUNDLE_WRITTEN,
     END_EVENTS,
     NOTICE_ENDS,
     ROLLED_BACK,
-    STOP_ASKED,
     STOPPING,
 )
-from dora_systemd.decisions.logs.query import (
-    PROCESS_EXITED,
-    UNIT_ENDS,
-    UNIT_FAILED,
-    UNIT_STARTING,
-)
+from dora_systemd.decisions.logs.query import UNIT_ENDS, UNIT_FAILED
 from dora_systemd.names import is_node_id, is_readable, is_uuid
 from dora_systemd.values import SECOND, format_duration, format_moment
 
@@ -96,14 +90,14 @@ def read_story(
     """
     found: list[Happened] = []
     causes: dict[str, tuple[str, str, str]] = {}
-    kills = _Kills()
+    kills = Kills()
     bound = last.until_us if last else now_us - LOOK_BACK
     for record in islice(records, MOST_RECORDS):
         mono_us = _number(record, "__MONOTONIC_TIMESTAMP")
         if record.get("_BOOT_ID") != boot or mono_us <= bound:
             break
         event = str(record.get("DORA_EVENT", ""))
-        kills.read(record, event)
+        kills.read(record)
         if event in NOTICE_ENDS:
             if "DORA_UNTIL" not in record:
                 continue  # a bundle that was requested
@@ -117,30 +111,6 @@ def read_story(
             found.append(one)
     failures = (one for one in found if one.what != FAILED or one.cause not in kills.requested)
     return [_with_cause(one, causes) for one in failures], last
-
-
-class _Kills:
-    """Finds the lives whose end was requested by `doractl stop --now`: systemd calls them failed.
-
-    It gets the records newest first. requested: their INVOCATION_ID.
-    """
-
-    def __init__(self) -> None:
-        self.requested: set[str] = set()
-        self._failed: dict[str, str] = {}  # the UUIDs of lives that SIGKILL has ended
-        self._running: dict[str, str] = {}  # those of which the older records are from before that
-
-    def read(self, record: Mapping[str, Any], event: str) -> None:
-        """Read the next record, with its DORA_EVENT."""
-        uuid, kind = _uuid(record), record.get("MESSAGE_ID")
-        if event == "dataflow-failed" and record.get("DORA_REASON") == BY_SIGKILL:
-            self._failed[str(record.get("_SYSTEMD_INVOCATION_ID", ""))] = uuid
-        elif event == STOP_ASKED:
-            self.requested |= {life for life, own in self._running.items() if own == uuid != ""}
-        elif kind == PROCESS_EXITED and (life := _life(record)) in self._failed:
-            self._running[life] = self._failed.pop(life)
-        elif kind == UNIT_STARTING:
-            self._running.pop(_life(record), None)
 
 
 def has_lost_power(records: Iterable[Mapping[str, Any]], boot: str) -> bool:
@@ -167,18 +137,13 @@ def _happened(record: Mapping[str, Any], event: str, mono_us: int) -> Happened |
     if record.get("MESSAGE_ID") == UNIT_FAILED:
         # Each failure of the unit has one such record, also if the runner could write nothing. Its
         # cause is what the runner has written in the same life.
-        return Happened(FAILED, at_us, mono_us, cause=_life(record), uuid=_uuid(record))
+        return Happened(FAILED, at_us, mono_us, cause=life_of(record), uuid=_uuid(record))
     if event not in _WORDS:
         return None
     cause = plain(record.get("DORA_REASON", ""))
     if machine := record.get("DORA_MACHINE"):
         cause = f"machine {plain(machine)}: {cause}"
     return Happened(_WORDS[event], at_us, mono_us, _first_node(record), cause)
-
-
-def _life(record: Mapping[str, Any]) -> str:
-    """The life of a record of systemd."""
-    return str(record.get("INVOCATION_ID") or record.get("USER_INVOCATION_ID") or "")
 
 
 def _first_node(record: Mapping[str, Any]) -> str:

@@ -14,7 +14,9 @@ from dora_systemd.adapters.bus.manager import DOWN, ON_THE_WAY, SETTLED, Manager
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owes import Owed, owes_of
-from dora_systemd.decisions.logs.query import scope_matches
+from dora_systemd.decisions.life.causes import BY_SIGKILL
+from dora_systemd.decisions.life.kills import Kills
+from dora_systemd.decisions.logs.query import kill_matches, scope_matches
 from dora_systemd.decisions.releases.progress import Step, soaking, starting, stopping
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
 from dora_systemd.decisions.why.lives import Happening, parse_happening
@@ -43,6 +45,7 @@ _STEP_SECONDS = 0.2
 _LOOK_SECONDS = 1.0
 _MOST_RECORDS = 200
 _MICROSECOND_NS = 1000
+_STOPPED = Fault("it was stopped", is_stop=True)
 
 
 def settle(
@@ -209,7 +212,7 @@ class Gate:
     def _end(self, state: str) -> Fault | None:
         """Judge the end of the unit: a dataflow may finish, everything else is a fault."""
         found = self._happenings()
-        if fault := find_fault(found, self._before, self._may_wait):
+        if fault := self._found(found):
             # The runner's own words have the number of restarts, and may name other nodes, too.
             words = failure_reason(self._manager, self._unit)
             is_same = words.startswith(f"node {fault.node}: ") and ", node " not in words
@@ -218,11 +221,28 @@ class Gate:
             return Fault(refusal.message)
         if state == "inactive":
             is_done = is_finished(found)
-            return None if is_done else Fault("it was stopped", is_stop=True)
+            return None if is_done else _STOPPED
         return Fault(failure_reason(self._manager, self._unit))
 
     def _fault(self) -> Fault | None:
-        return find_fault(self._happenings(), self._before, self._may_wait)
+        return self._found(self._happenings())
+
+    def _found(self, happenings: Sequence[Happening]) -> Fault | None:
+        fault = find_fault(happenings, self._before, self._may_wait)
+        if fault and fault.reason == BY_SIGKILL and self._is_kill_requested():
+            return _STOPPED
+        return fault
+
+    def _is_kill_requested(self) -> bool:
+        """Whether `stop --now` has ended the trial: then nothing must start instead."""
+        name, kills = self._options.name, Kills()
+        matches = [*scope_matches(self._scope, name), "DORA_EVENT=dataflow-failed"]
+        matches += ["+", *kill_matches(self._scope, name)]
+        with suppress(DoraSystemdError):
+            records = JournalReader().newest(matches, _MOST_RECORDS)
+            for one in takewhile(self._is_new, records):
+                kills.read(one)
+        return bool(kills.requested)
 
     def _happenings(self) -> list[Happening]:
         """Read the records of the trial, newest first."""

@@ -9,7 +9,9 @@ import pytest
 
 from dora_systemd.decisions.cell.owes import Owed
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
+from dora_systemd.decisions.life.causes import BY_SIGKILL
 from dora_systemd.decisions.logs.journal_events import EVENTS
+from dora_systemd.decisions.logs.query import PROCESS_EXITED, UNIT_STARTING
 from dora_systemd.decisions.releases.progress import Step, starting, stopping
 from dora_systemd.decisions.why.trial_faults import Fault
 from dora_systemd.scope import Scope
@@ -17,7 +19,7 @@ from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.lives import now_boot
 from dora_systemd.verbs.releases.soak import LATE, Gate, settle
 from tests.unit.fakes.journal import FakeJournal, life_record
-from tests.unit.fakes.manager import FakeManager, options, with_owes
+from tests.unit.fakes.manager import UUID, FakeManager, options, with_owes
 
 HUNG = "the supervisor process hung and was killed by the watchdog"
 STOPPED = Fault("it was stopped", is_stop=True)
@@ -248,6 +250,34 @@ def test_what_its_end_means(
     manager.units[unit] |= facts
     journal.write(*records)
     assert gate._wait_ready(SECOND) == fault
+
+
+def of_systemd(message: str, at: float) -> dict[str, object]:
+    """A record of systemd about the life of the trial."""
+    own = {"UNIT": "dora-robot.service", "_PID": "1", "INVOCATION_ID": "1"}
+    return {**record("", MESSAGE_ID=message, **own), "__MONOTONIC_TIMESTAMP": str(int(at * SECOND))}
+
+
+@pytest.mark.parametrize("asked_at", [1001.5, 1002.5, 0])
+def test_a_requested_kill_is_a_stop(
+    manager: FakeManager, scope: Scope, clock: list[float], journal: FakeJournal, asked_at: float
+) -> None:
+    assert clock
+    manager.add(options(), "failed", InvocationID=b"")
+    gate = Gate(manager, scope, options(), lambda _: None)
+    known = {"DORA_DATAFLOW": UUID, "DORA_DATAFLOW_NAME": "robot"}
+    asked = record("stop-asked", MESSAGE_ID="x", _UID="0", **known)
+    end = record("dataflow-failed", DORA_REASON=BY_SIGKILL, **known)
+    journal.write(
+        end,
+        *([asked] if asked_at > 1002 else []),
+        of_systemd(PROCESS_EXITED, 1002),
+        *([asked] if 0 < asked_at < 1002 else []),
+        of_systemd(UNIT_STARTING, 1001),
+        asked,
+    )
+    found = gate._wait_ready(SECOND)
+    assert found == (STOPPED if asked_at == 1001.5 else Fault(BY_SIGKILL))
 
 
 def test_what_is_told_until_it_is_ready(scope: Scope, clock: list[float]) -> None:
