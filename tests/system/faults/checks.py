@@ -34,6 +34,9 @@ def check_dora(scene: Scene) -> bool:
     # Dora finds stopped nodes one by one, and what they printed before counts as printed since.
     if any(process_state(pid) == "T" for pid in state.pids):
         return False
+    # The table has the process of one that dora has just killed for a moment still.
+    if any(scene.cell.status.nodes[role].pid not in state.pids for role in ROLES):
+        return False
     return state.node_restarts != scene.before.node_restarts and is_exchanging(scene)
 
 
