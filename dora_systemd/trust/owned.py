@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust import scribe
-from dora_systemd.trust.programs import account_of_uid, spawn
+from dora_systemd.trust.programs import account_of_uid, end_child, spawn
 from dora_systemd.trust.sight import receive, send
 from dora_systemd.values import shown
 
@@ -54,7 +54,6 @@ def _as_user(path: str, before: bytes, after: bytes, owner: int) -> None:
     except (BrokenPipeError, ValueError) as error:
         raise OSError(0, f"no answer of user {account.name}") from error
     finally:
-        child.kill()
-        child.communicate()
+        end_child(child)
     if reason:
         raise OSError(0, reason.decode("utf-8", "replace"))

@@ -6,8 +6,10 @@
   directories above them and their interpreters.
 """
 
+import contextlib
 import os
 import pwd
+import select
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +22,7 @@ from dora_systemd.values import shown
 _User = TypeVar("_User", int, str)
 DEFAULT_PATH = "/usr/local/bin:/usr/bin:/bin"
 _LANGUAGE = "C.UTF-8"
+_END_SECONDS = 2.0
 _FIRST_LINE = 256
 """Bytes of the line "#!INTERPRETER" that the kernel reads, see execve(2)."""
 
@@ -120,6 +123,26 @@ def spawn(
         group=None if other is None else other.gid,
         extra_groups=None if other is None else other.groups,
     )
+
+
+def end_child(child: "subprocess.Popen[bytes]") -> None:
+    """Kill a child process, close its streams, and wait for its end as long as that is sure.
+
+    A child of another account may be traced by that account. The kernel then reports the end to the
+    tracer first, which may never fetch it, see ptrace(2). The child may also be inside of a mount
+    that hangs. Such a child stays a zombie until we end.
+    """
+    child.kill()
+    for stream in (child.stdin, child.stdout, child.stderr):
+        if stream:
+            with contextlib.suppress(OSError):  # the first may still have bytes for it
+                stream.close()
+    if child.returncode is None:
+        poll, ended = select.poll(), os.pidfd_open(child.pid)
+        poll.register(ended, select.POLLIN)
+        poll.poll(_END_SECONDS * 1000)
+        os.close(ended)
+        child.poll()
 
 
 def become(account: Account) -> None:

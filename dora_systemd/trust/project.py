@@ -22,7 +22,7 @@ from typing import Any
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import cut
 from dora_systemd.trust import courier
-from dora_systemd.trust.programs import Account, account_of_uid
+from dora_systemd.trust.programs import Account, account_of_uid, end_child
 from dora_systemd.trust.sight import receive, send, start_reader
 from dora_systemd.values import shown
 
@@ -232,5 +232,4 @@ def opened_project(
         # With its git, if that hangs: the child is the leader of its process group.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
-        with contextlib.suppress(OSError), child:
-            pass
+        end_child(child)

@@ -19,7 +19,7 @@ from pathlib import Path
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust import eyes
 from dora_systemd.trust.files import MAX_BYTES
-from dora_systemd.trust.programs import Account, spawn
+from dora_systemd.trust.programs import Account, end_child, spawn
 from dora_systemd.values import shown
 
 _SECONDS = 5.0
@@ -156,10 +156,7 @@ def sight_of(account: Account | None, seconds: float = _SECONDS) -> Iterator[Sig
     try:
         yield LentSight(child, account, seconds)
     finally:
-        child.kill()
-        # Closes its streams, of which the first may still have bytes for it, and waits for it.
-        with contextlib.suppress(OSError), child:
-            pass
+        end_child(child)
 
 
 def start_reader(

@@ -2,8 +2,10 @@
 
 import os
 import pwd
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -14,11 +16,27 @@ from dora_systemd.trust.programs import (
     account_from,
     account_of_uid,
     check_program,
+    end_child,
     fresh_environment,
     own_account,
     require_user,
     spawn,
 )
+
+TRACE = """
+import ctypes, sys, time
+ptrace = ctypes.CDLL(None).ptrace
+ptrace.argtypes = [ctypes.c_long] * 4
+print(ptrace(0x4206, int(sys.argv[1]), 0, 0), flush=True)  # PTRACE_SEIZE
+time.sleep(100)
+"""
+# PR_SET_PTRACER: any process of the same user may trace this one, whatever Yama says.
+TRACED = """
+import ctypes, time
+ctypes.CDLL(None).prctl(0x59616D61, ctypes.c_ulong(-1), 0, 0, 0)
+print(flush=True)
+time.sleep(100)
+"""
 
 root_only = pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
 NOBODY, GONE = 65534, 3_999_999_999
@@ -128,3 +146,28 @@ def test_a_user_that_is_gone() -> None:
             account_of_uid(uid)
         assert caught.value.code is ExitCode.NOT_FOUND
     assert account_from(pwd.getpwuid(0)).home == "/root"
+
+
+def test_a_child_that_another_process_traces_is_not_waited_for() -> None:
+    """The kernel reports the end of a child to its tracer first."""
+    child = spawn([sys.executable, "-c", TRACED], own_account(), stdin=subprocess.PIPE)
+    assert child.stdout
+    assert child.stdout.readline()
+    command = [sys.executable, "-c", TRACE, str(child.pid)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as tracer:
+        assert tracer.stdout
+        assert tracer.stdout.readline() == b"0\n"
+        begun = time.monotonic()
+        end_child(child)
+        assert time.monotonic() - begun < 30
+        assert child.returncode is None
+        tracer.kill()
+    assert child.wait(30) == -signal.SIGKILL
+
+
+def test_a_child_ends_although_another_process_has_its_streams() -> None:
+    child = spawn(["sleep", "100"], own_account(), stdin=subprocess.PIPE)
+    with Path(f"/proc/{child.pid}/fd/2").open("wb"):
+        end_child(child)
+    assert child.returncode == -signal.SIGKILL
+    assert [one.closed for one in (child.stdin, child.stdout, child.stderr) if one] == [True] * 3
