@@ -129,8 +129,7 @@ def read_present(path: Path) -> Usage:
     # Texts for paths, here and below: a Path takes longer than the kernel does for a file.
     memory = read_number(f"{path}/memory.current")
     if memory is None:
-        some = islice(_pids(islice(_tree(path), MAX_GROUPS)), MAX_PROCESSES)
-        memory = sum(map(_resident_bytes, some))
+        memory = sum(map(_resident_bytes, some_pids(path)))
     return read_cpu(path)._replace(
         memory=memory,
         memory_max=read_number(f"{path}/memory.max"),
@@ -154,6 +153,11 @@ def read_numbers(path: str | Path) -> dict[str, int]:
 def pids(path: Path) -> list[int]:
     """The processes of a group and of all groups below it."""
     return list(_pids(_tree(path)))
+
+
+def some_pids(path: Path) -> list[int]:
+    """Up to MAX_PROCESSES processes of up to MAX_GROUPS groups, for readers outside the cell."""
+    return list(islice(_pids(islice(_tree(path), MAX_GROUPS)), MAX_PROCESSES))
 
 
 def _pids(groups: Iterable[str]) -> Iterator[int]:

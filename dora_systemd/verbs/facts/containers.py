@@ -40,7 +40,7 @@ Containers = Mapping[str, tuple[Container, ...]]
 def read_containers(groups: Mapping[str, Path], proc: Path = PROC) -> Containers:
     """The containers of the nodes with these groups; {} if no process of a node is a client."""
     clients = {
-        node: read_clients(cgroup.pids(path)[: cgroup.MAX_PROCESSES], proc)
+        node: read_clients(cgroup.some_pids(path), proc)
         for node, path in groups.items()
         if node != WHOLE_CELL
     }
@@ -85,7 +85,7 @@ def _add_of_daemons(
 
 def _begun(group: str, proc: Path) -> float:
     """When the first process in a group began, 0 without any."""
-    pids = cgroup.pids(cgroup.group_path(group))
+    pids = cgroup.some_pids(cgroup.group_path(group))
     return min(filter(None, (process_start(pid, proc) for pid in pids)), default=0.0)
 
 

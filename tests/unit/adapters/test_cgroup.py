@@ -110,6 +110,17 @@ def test_pids_of_the_whole_tree(unit: Path) -> None:
     assert sorted(cgroup.pids(unit)) == [1, 2, 3]
 
 
+def test_some_pids_of_a_tree_without_end(unit: Path) -> None:
+    """The user of a dataflow can create any number of groups in it."""
+    groups = [unit / "node-camera" / f"{number:05}" for number in range(cgroup.MAX_GROUPS + 10)]
+    for pid, group in enumerate(groups):
+        group.mkdir()
+        (group / "cgroup.procs").write_text(f"{pid}\n")
+    assert len(cgroup.some_pids(unit / "node-camera")) == cgroup.MAX_GROUPS - 1
+    (groups[0] / "cgroup.procs").write_text("5\n" * (cgroup.MAX_PROCESSES + 10))
+    assert len(cgroup.some_pids(groups[0])) == cgroup.MAX_PROCESSES
+
+
 def test_controllers_are_enabled_one_by_one(unit: Path) -> None:
     (unit / "cgroup.controllers").write_text("cpu memory\n")
     (unit / "cgroup.subtree_control").write_text("")

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.verbs.facts.containers import (
     left_of,
     outside_of,
@@ -86,6 +87,14 @@ def test_docker(machine: Machine) -> None:
     machine.add(20, "/system.slice/docker-" + "c" * 64 + ".scope", "sleep", began=150)
     machine.add(21, f"/system.slice/docker-{DOCKER}.scope", "sleep", began=201)
     assert machine.read() == {"policy": [("docker", DOCKER, False)]}
+
+
+def test_groups_in_a_node_without_end(machine: Machine) -> None:
+    """Their user can create any number: a reader of all dataflows must not look at each."""
+    for number in range(cgroup.MAX_GROUPS):
+        (machine.mount / NODE[1:] / f"a{number:05}").mkdir()
+    machine.add(11, f"{NODE}/z/z", "conmon", "-c", ID)
+    assert machine.read() == {}
 
 
 def test_what_a_stop_leaves(machine: Machine) -> None:
