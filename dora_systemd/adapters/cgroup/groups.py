@@ -78,6 +78,13 @@ def has_group(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112 - a Path takes longer
 
 
+def maker_of(path: Path) -> int | None:
+    """The uid that owns the parent of a group, and so can make groups there; None without it."""
+    with contextlib.suppress(OSError):
+        return path.parent.stat().st_uid
+    return None
+
+
 def node_groups(path: Path) -> dict[str, Path]:
     """Directories of the node groups below a unit's `path`, by node id."""
     return _by_node(path, sorted(one for one in _names(path) if one.startswith(NODE_PREFIX)))

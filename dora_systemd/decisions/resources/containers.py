@@ -153,17 +153,25 @@ def _monitor_of(
 
 
 def match_clients(
-    clients: Sequence[Client], begun: Mapping[str, float], known: Collection[str] = ()
+    clients: Sequence[Client],
+    begun: Mapping[str, float],
+    makers: Mapping[str, int | None],
+    known: Collection[str] = (),
 ) -> list[Container]:
     """The container of each client of a daemon, by the times of their beginnings.
 
-    begun: when the first process in each cgroup of a container began. known: IDs of containers
-    that belong to others.
+    begun: when the first process in each cgroup of a container began. makers: the uids that can
+    have made these cgroups; any user can make one whose name is that of another container. known:
+    IDs of containers that belong to others.
     """
     left = sorted((at, group) for group, at in begun.items() if id_of_group(group) not in known)
     found = []
     for one in sorted(clients, key=lambda client: client.began):
-        hits = [(at, group) for at, group in left if 0 <= at - one.began <= MOST_WAIT]
+        hits = [
+            (at, group)
+            for at, group in left
+            if 0 <= at - one.began <= MOST_WAIT and makers.get(group) in (0, one.uid)
+        ]
         if not hits:
             found.append(Container(one.program))
             continue

@@ -77,9 +77,10 @@ def _add_of_daemons(
     known = [one.id for some in found.values() for one in some]
     groups = cgroup.find_groups(may_be_of_daemon, _MOST_GROUPS)
     begun = {group: at for group in groups if (at := _begun(group, proc))}
+    makers = {group: cgroup.maker_of(cgroup.group_path(group)) for group in begun}
     for node, some in clients.items():
         others = [one for one in some if one.program not in (MONITOR, PODMAN)]
-        found[node] += match_clients(others, begun, known)
+        found[node] += match_clients(others, begun, makers, known)
         known += [one.id for one in found[node]]
 
 

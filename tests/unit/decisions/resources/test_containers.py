@@ -119,11 +119,20 @@ def test_clients_of_a_daemon() -> None:
     """By time: each has the first that began after it and that no other has."""
     old, first, second = (f"/system.slice/docker-{one * 64}.scope" for one in "0ab")
     begun = {second: 13.0, first: 11.0, old: 2.0}
-    found = match_clients([docker(12.0), docker(10.0)], begun)
+    roots = dict.fromkeys(begun, 0)
+    found = match_clients([docker(12.0), docker(10.0)], begun, roots)
     assert [one.group for one in found] == [first, second]
     assert found[0] == Container("docker", ID, group=first)
-    assert match_clients([docker(10.0)], begun, {ID})[0].id == OTHER
-    assert match_clients([docker(14.0)], begun) == [Container("docker")]
+    assert match_clients([docker(10.0)], begun, roots, {ID})[0].id == OTHER
+    assert match_clients([docker(14.0)], begun, roots) == [Container("docker")]
+
+
+@pytest.mark.parametrize(("maker", "id"), [(0, ID), (7, ID), (8, ""), (None, "")])
+def test_a_group_that_another_user_has_made(maker: int | None, id: str) -> None:
+    """A rootless daemon belongs to the user of its client; other users may only claim a name."""
+    group = f"/dora.slice/dora-other.service/docker-{ID}.scope"
+    client = docker(10.0)._replace(uid=7)
+    assert match_clients([client], {group: 11.0}, {group: maker})[0].id == id
 
 
 HELLO = Container("podman", ID, "hello", f"/user.slice/libpod-{ID}.scope", 9 << 30)

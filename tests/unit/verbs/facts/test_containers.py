@@ -1,5 +1,6 @@
 """Containers of nodes, in a fake cgroup tree and a fake /proc."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -39,7 +40,8 @@ class Machine:
         (path / "comm").write_text(f"{name}\n")
         (path / "cmdline").write_text("".join(f"{one}\0" for one in words))
         (path / "cgroup").write_text(f"0::{group}\n")
-        (path / "status").write_text("Uid:\t1000\t1000\t1000\t1000\nNSpid:\t7\n")
+        # The groups are of the user who runs this test, and so are the clients.
+        (path / "status").write_text(f"Uid:\t0\t{os.getuid()}\t0\t0\nNSpid:\t7\n")
         (path / "stat").write_text(f"{pid} ({name}) S {parent}{' 0' * 17} {began * 100} 0 0\n")
 
     def read(self) -> dict[str, list[tuple[str, str, bool]]]:
