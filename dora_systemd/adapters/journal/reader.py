@@ -42,6 +42,7 @@ _VOLATILE = "run/log/journal"
 _PLACES = {_VOLATILE: Place.MEMORY, _PERSISTENT: Place.DISK}
 
 _LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
+_NAME_FIELDS = ("DORA_DATAFLOW", "DORA_DATAFLOW_NAME", "_SYSTEMD_UNIT", "_SYSTEMD_USER_UNIT")
 _LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
 
 MAX_LINE = 1024 * 1024
@@ -132,9 +133,15 @@ class JournalReader:
         return sum(data.count(b"\n") for data in output)
 
     def name_of(self, scope: Scope, uuid: str) -> str:
-        """The name of the dataflow `uuid` of `scope`, "" if it has no record."""
-        records = self.newest([*scope_matches(scope), f"DORA_DATAFLOW={uuid}"], _MOST_FORGED)
-        return next(filter(None, map(_trusted_name, records)), "")
+        """The name of the dataflow `uuid` of `scope`, "" if it has no record.
+
+        A node can write the UUID of another dataflow, too. Its record has two then: systemd adds
+        that of its own dataflow, see LogExtraFields= in systemd.exec(5).
+        """
+        matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}"]
+        records = self.newest(matches, None, fields=_NAME_FIELDS)
+        own = (one for one in records if one.get("DORA_DATAFLOW") == uuid)
+        return next(filter(None, map(_trusted_name, own)), "")
 
     def newest(
         self,

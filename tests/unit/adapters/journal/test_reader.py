@@ -262,6 +262,17 @@ def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
     assert JournalReader().name_of(SYSTEM, ENDED) == "a"
 
 
+def test_a_node_that_writes_the_uuid_of_another_dataflow(journalctl: Path) -> None:
+    """journalctl prints both values of the field: systemd has added that of the node's own."""
+    own = "44f30e60-107e-41d2-b6a8-b30cefc153ae"
+    of_a = {"DORA_DATAFLOW_NAME": "a", "_SYSTEMD_UNIT": "dora-a.service"}
+    of_b = {"DORA_DATAFLOW_NAME": "b", "_SYSTEMD_UNIT": "dora-b.service"}
+    forged = {**of_b, "DORA_DATAFLOW": [own, ENDED]}
+    lines = "\n".join(map(json.dumps, [*[forged] * 200, {**of_a, "DORA_DATAFLOW": ENDED}]))
+    make_program(journalctl, f"cat <<'E'\n{lines}\nE")
+    assert JournalReader().name_of(SYSTEM, ENDED) == "a"
+
+
 def test_an_endless_journal_has_an_end(journalctl: Path) -> None:
     make_program(journalctl, """while :; do printf '{"MESSAGE":"%02000d"}\\n' 7; done""")
     assert 0 < len(list(JournalReader(Bounds(1 << 20)).newest([], None))) < 600
