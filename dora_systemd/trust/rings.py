@@ -1,14 +1,14 @@
 """Finds the memory of a recorder in the process that keeps it: systemd's manager.
 
-Every user's unit can have systemd keep a file of any name. So a ring counts only if it belongs to
-the user of the dataflow, and its header has the UUID of that. What it contains is hostile: see
-dora_systemd.decisions.recorder.reading.
+Every user's unit can have systemd keep a file of any name. So a ring counts only if it is a regular
+file that belongs to the user of the dataflow, and its header has the UUID of that. What it contains
+is hostile: see dora_systemd.decisions.recorder.reading.
 """
 
 import os
 import stat
 from collections.abc import Iterable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from dora_systemd.decisions.recorder.ring import ALIGN, Header, parse_header
@@ -69,15 +69,26 @@ def _target(path: Path) -> str:
 
 
 def _open(path: Path, uuid: str, uid: int) -> RingFile | None:
-    try:
-        fd = os.open(path, _FLAGS)
-    except OSError:
+    fd = _open_own(path, uid)
+    if fd is None:
         return None
     with suppress(OSError, ValueError):
-        status = os.fstat(fd)
         header = parse_header(os.pread(fd, ALIGN, 0))
-        is_own = stat.S_ISREG(status.st_mode) and status.st_uid == uid
-        if is_own and header.facts.get("uuid") == uuid:
+        if header.facts.get("uuid") == uuid:
             return RingFile(fd, header)
     os.close(fd)
+    return None
+
+
+def _open_own(path: Path, uid: int) -> int | None:
+    """Open a regular file of the user, and nothing else: opening a device can do something.
+
+    In a mount namespace of an own, any user can give any file the name of a ring.
+    """
+    with suppress(OSError), ExitStack() as held:
+        found = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        held.callback(os.close, found)
+        status = os.fstat(found)
+        if stat.S_ISREG(status.st_mode) and status.st_uid == uid:
+            return os.open(f"/proc/self/fd/{found}", _FLAGS)  # see proc_pid_fd(5)
     return None
