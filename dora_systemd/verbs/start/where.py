@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dora_systemd.adapters.dora.command import find_dora
-from dora_systemd.adapters.host.files import decoded, read_text
+from dora_systemd.adapters.host.files import decoded
 from dora_systemd.decisions.cell.environment import unit_environment
 from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -32,7 +32,7 @@ from dora_systemd.decisions.settings.table import (
 )
 from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.scope import Scope
-from dora_systemd.trust.files import unreadable
+from dora_systemd.trust.files import read_file, unreadable
 from dora_systemd.trust.paths import Place, reached, user_name
 from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.trust.sight import Sight, cannot_reach
@@ -229,10 +229,15 @@ def find_uv(search_path: str, sight: Sight, home: str = "") -> str:
 
 
 def given_variables(settings: Settings, sight: Sight) -> dict[str, str]:
-    """The variables of --env and --env-file; --env has precedence, then the last file."""
+    """The variables of --env and --env-file; --env has precedence, then the last file.
+
+    A start by name reads the files again, and every user sees the variables: a user who has
+    replaced a file by a link meanwhile must not get another file read by root.
+    """
     variables: dict[str, str] = {}
     for file in settings[ENV_FILE]:
-        text = _read_lent(file, sight) if file in settings.lent else read_text(Path(file))
+        is_lent = file in settings.lent
+        text = _read_lent(file, sight) if is_lent else decoded(read_file(file).data, Path(file))
         variables |= parse_environment_file(text, file)
     given = settings[ENV]
     return {**variables, **given}

@@ -1,11 +1,14 @@
 """What a start finds on the machine."""
 
+import os
 from pathlib import Path
 
 import pytest
 
+from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.sight import Sight
-from dora_systemd.verbs.start.where import find_uv
+from dora_systemd.verbs.start.where import find_uv, given_variables
 from tests.unit.fakes.programs import make_program
 
 
@@ -38,3 +41,21 @@ def test_without_a_home_directory_there_is_path_only(tmp_path: Path) -> None:
 def test_a_uv_that_cannot_be_executed_is_none(tmp_path: Path) -> None:
     (tmp_path / "uv").write_text("#!/bin/sh\n")
     assert find_uv(str(tmp_path), Sight()) == ""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root reads what others may not")
+def test_a_link_of_another_user_to_variables_of_root(tmp_path: Path) -> None:
+    """Every user sees the variables of a unit."""
+    secret, file = tmp_path / "secret", tmp_path / "home/own.env"
+    secret.write_text("TOKEN=root\n")
+    secret.chmod(0o600)
+    file.parent.mkdir()
+    os.chown(file.parent, 65534, 65534)
+    settings = resolve_settings({"env_file": (str(file),)}, {}, [])
+    file.write_text("TOKEN=own\n")
+    os.chown(file, 65534, 65534)
+    assert given_variables(settings, Sight()) == {"TOKEN": "own"}
+    file.unlink()
+    file.symlink_to(secret)
+    with pytest.raises(DoraSystemdError, match="is a symbolic link that users other than root"):
+        given_variables(settings, Sight())
