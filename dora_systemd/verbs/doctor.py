@@ -290,7 +290,10 @@ def _versions(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
         text, remedy = dataflow_row(manager, scope, cell).upgrade
         if text:
             yield Finding("versions", State.NOTE, f"{cell.name}: {text}", remedy)
-        text, remedy = version_trouble_of(manager, cell)
+        try:
+            text, remedy = version_trouble_of(manager, cell)
+        except DoraSystemdError as error:  # of one dataflow, which must not hide the others
+            text, remedy = error.message, error.hint
         if text:
             yield Finding("versions", State.WARNING, f"{cell.name}: {text}", remedy)
 

@@ -193,11 +193,19 @@ def _wheel(prefix: str, wheel: str, sight: Sight) -> str:
 
 
 def version_trouble_of(manager: Manager, cell: Cell) -> tuple[str, str]:
-    """Return what version_trouble() returns for a loaded dataflow, as the user of its nodes."""
+    """Return what version_trouble() returns for a loaded dataflow, as the user of its nodes.
+
+    Raises DoraSystemdError as that does, and if that user was deleted.
+    """
     if not cell.options.venv:
         return "", ""
     user = manager.read(cell.unit, ["User"])["User"]
-    with sight_of(account_from(pwd.getpwnam(user)) if user else None) as sight:
+    try:
+        account = account_from(pwd.getpwnam(user)) if user else None
+    except KeyError as error:
+        message = f"cannot look at {cell.options.venv} as user {user}: there is none any more"
+        raise DoraSystemdError(message, "create that user again") from error
+    with sight_of(account) as sight:
         return version_trouble(cell.options.venv, cell.options.dora, sight)
 
 
@@ -205,7 +213,7 @@ def version_warnings(manager: Manager, cells: Iterable[Cell]) -> Iterator[str]:
     """Warn of dataflows that run, and whose nodes have another dora than their daemon."""
     for cell in cells:
         # A version that no daemon takes is an error of the start, or of the node.
-        with suppress(DoraSystemdError, KeyError):
+        with suppress(DoraSystemdError):
             text, remedy = version_trouble_of(manager, cell)
             if text:
                 yield f"{cell.name}: {text}: {remedy}"

@@ -24,6 +24,9 @@ from tests.unit.fakes.programs import make_dora, make_program
 from tests.unit.verbs.start.test_programs import install
 from tests.unit.verbs.start.test_start import make_plan, place
 
+GONE = 3_999_999_999
+"""A uid that nobody has."""
+
 
 @pytest.fixture
 def manager(manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeManager:
@@ -38,7 +41,7 @@ def manager(manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
     monkeypatch.setenv("XDG_CONFIG_HOME", "/config")
     monkeypatch.delenv("VIRTUAL_ENV", raising=False)
-    monkeypatch.setattr(pwd, "getpwnam", lambda _name: pwd.getpwuid(0))
+    monkeypatch.setattr(pwd, "getpwnam", lambda name: pwd.getpwuid(GONE if name == "gone" else 0))
     return manager
 
 
@@ -229,6 +232,20 @@ def test_nodes_with_another_dora(manager: FakeManager, scope: Scope, tmp_path: P
     assert finding.remedy.endswith("dora-rs==1.1.0")
     (cell,) = read_cells(manager)
     assert [*version_warnings(manager, [cell])] == [f"{finding.text}: {finding.remedy}"]
+
+
+@pytest.mark.parametrize("user", ["", "gone"])
+def test_a_venv_that_hides_no_other(manager: FakeManager, scope: Scope, user: str) -> None:
+    """What its owner has there, or that this user is gone, concerns one dataflow alone."""
+    place = scope.runtime_root / "programs"
+    prefix = install(place / "tool", "dora_rs_cli", "1.1.0")
+    for name, version in (("arm", "0.3.0"), ("robot", "1.0.1")):
+        venv = install(place / name, "dora_rs", version)
+        unit = manager.add(options(name, venv=venv, dora=f"{prefix}/bin/dora"))
+        manager.units[unit]["User"] = user if name == "arm" else ""
+    first, second = (one.text for one in look(manager, scope) if one.topic == "versions")
+    assert ("user gone: there is none" if user else "0.3.0, 1.0 or newer is needed") in first
+    assert second == "robot: the nodes' dora is 1.0.1, the daemon is 1.1.0"
 
 
 def test_dataflows_of_another_version(manager: FakeManager, scope: Scope) -> None:
