@@ -36,6 +36,9 @@ _CHUNK = 65536
 class Sight:
     """The file system as an account sees it, here the caller. All paths are absolute."""
 
+    user = ""
+    """The name of another account than the caller."""
+
     def exists(self, path: str) -> bool:
         return self._is(b"e", path)
 
@@ -104,6 +107,7 @@ class LentSight(Sight):
     ) -> None:
         self._child = child
         self._account = account
+        self.user = account.name
         self._left = seconds
         self._known: dict[tuple[bytes, str], bytes | int] = {}
 

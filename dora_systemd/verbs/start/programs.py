@@ -7,6 +7,7 @@ in another user's home, or on the machine that the project was copied from.
 import os
 import pwd
 import re
+import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -222,13 +223,16 @@ def version_warnings(manager: Manager, cells: Iterable[Cell]) -> Iterator[str]:
 def version_trouble(venv: str | None, dora: str, sight: Sight) -> tuple[str, str]:
     """Compare the dora of Python nodes with that of the daemon: what differs, and a remedy, or "".
 
-    venv: of the nodes. Raises DoraSystemdError (BAD_INPUT) for a dora that no daemon takes.
+    The remedy runs a program of the user of the nodes, which must not run as root. venv: of the
+    nodes. Raises DoraSystemdError (BAD_INPUT) for a dora that no daemon takes.
     """
     version = _wheel(venv, "dora_rs", sight) if venv else ""
     if not version or not venv:
         return "", ""
     has_pip = sight.exists(f"{venv}/bin/pip")  # uv's have none
-    install = f"{venv}/bin/pip install" if has_pip else f"uv pip install --python {venv}"
+    place = shlex.quote(shown(venv))
+    install = f"{place}/bin/pip install" if has_pip else f"uv pip install --python {place}"
+    install = f"as {sight.user}: {install}" if sight.user else install
     if version_numbers(version) < OLDEST_DORA:
         message = f"cannot start nodes with the Python of {shown(venv)}: their dora is "
         message += f"{version}, 1.0 or newer is needed"

@@ -145,6 +145,19 @@ def install(prefix: Path, wheel: str, version: str, python: str = "python3.13") 
     return str(prefix)
 
 
+class SightOfAlice(Sight):
+    user = "alice"
+
+
+def test_what_root_is_advised_is_no_program_for_root(tmp_path: Path) -> None:
+    """Alice chooses the path, and what is there."""
+    dora = install(tmp_path / "dora", "dora_rs_cli", "1.1.0") + "/bin/dora"
+    venv = install(tmp_path / "a;b", "dora_rs", "1.0.1")
+    make_program(Path(venv) / "bin/pip")
+    _, remedy = version_trouble(venv, dora, SightOfAlice())
+    assert remedy == f"as alice: '{venv}'/bin/pip install dora-rs==1.1.0"
+
+
 def test_versions_of_nodes_and_daemon(tmp_path: Path) -> None:
     venv, other = install(tmp_path / "v", "dora_rs", "1.0.1"), tmp_path / "dora"
     install(other, "dora_rs_cli", "1.1.0", "python3.11")
