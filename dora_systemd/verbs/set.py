@@ -79,7 +79,8 @@ def set_limits(
         _limit_groups(unit, nodes, undo)
         if nodes or rates:
             remember(unit, runner_texts(settings), undo)
-        if rates and unit["ControlGroup"]:
+        # systemd gives a unit that does not run a group, too, when it sets a property of it.
+        if rates and cell.has_begun and unit["ControlGroup"]:
             limit_lines(scope, cell, variables_of(unit), rates, undo, ask)
         if properties:
             manager.set_properties(cell.unit, list(properties.values()), is_fleeting)

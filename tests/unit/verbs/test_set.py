@@ -340,9 +340,11 @@ def test_lines_of_nodes_on_other_machines(place: Place) -> None:
     assert rates(place, "camera=9/1s", runner=Runner()) == ()
 
 
-def test_lines_of_one_that_does_not_run(place: Place) -> None:
+@pytest.mark.parametrize("facts", [{"ControlGroup": ""}, {"ActiveState": "inactive"}])
+def test_lines_of_one_that_does_not_run(place: Place, facts: dict[str, str]) -> None:
+    """One that is down has a group as soon as systemd has set a limit of it."""
     runner = Runner()
-    place.manager.units[place.unit]["ControlGroup"] = ""
+    place.manager.units[place.unit] |= facts
     rates(place, "camera=infinity", runner=runner)
     assert runner.asked == []
     assert "camera:log_rate_limit=infinity" in place.drop_in.with_name(SET_FILE).read_text()
