@@ -19,7 +19,7 @@ from dora_systemd.decisions.cell.environment import changes_entry, changes_of, w
 from dora_systemd.decisions.cell.line_rates import RateLimits, rate_texts, rates_of
 from dora_systemd.decisions.cell.options import SettingText, changed, format_setting
 from dora_systemd.decisions.properties.assignments import typed
-from dora_systemd.decisions.recorder.record import format_record, parse_record
+from dora_systemd.decisions.recorder.record import Record, format_record, parse_record
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import usage_error
 from dora_systemd.names import release_of
@@ -52,6 +52,13 @@ def switch_hot_reload(
 
     Raises DoraSystemdError.
     """
+    check_hot_reload(cell, is_on)
+    with _remembered(manager, cell, SettingText("", "hot_reload", format_bool(is_on))):
+        ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
+
+
+def check_hot_reload(cell: Cell, is_on: bool) -> None:
+    """Raise DoraSystemdError if hot reload of the dataflow cannot be switched on or off."""
     require_running(cell)
     refuse_parts([cell], "set")
     _refuse_release(cell, f"set the hot reload of {cell.name}")
@@ -60,8 +67,6 @@ def switch_hot_reload(
         from dora_systemd.adapters.host.watch import require_watcher
 
         require_watcher()
-    with _remembered(manager, cell, SettingText("", "hot_reload", format_bool(is_on))):
-        ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
 
 
 def switch_record(
@@ -71,9 +76,7 @@ def switch_record(
 
     text: of the setting `record`. Raises DoraSystemdError.
     """
-    require_running(cell)
-    refuse_parts([cell], "set")
-    record, has_recorder = parse_record(text), cell.options.has("record")
+    record, has_recorder = checked_record(cell, text), cell.options.has("record")
     what = format_record(record)
     with _remembered(manager, cell, SettingText("", "record", what)):
         if has_recorder:
@@ -82,6 +85,13 @@ def switch_record(
         return ()
     restart = f"doractl restart {cell.name}"
     return (f"{cell.name} was started without record, and records from its restart on: {restart}",)
+
+
+def checked_record(cell: Cell, text: str) -> Record | None:
+    """What to record, from the text of the setting. Raises DoraSystemdError."""
+    require_running(cell)
+    refuse_parts([cell], "set")
+    return parse_record(text)
 
 
 @contextmanager

@@ -20,9 +20,13 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.node import require_running
 from dora_systemd.verbs.releases.listing import refuse_on_trial
-from dora_systemd.verbs.reload import switch_hot_reload, switch_record
+from dora_systemd.verbs.reload import (
+    check_hot_reload,
+    checked_record,
+    switch_hot_reload,
+    switch_record,
+)
 from dora_systemd.verbs.set import set_limits
 
 
@@ -58,8 +62,10 @@ def command(
     bus = Bus(scope)
     cell = Selector(selector).find_present(bus, scope)
     refuse_on_trial(scope, cell, "set")
-    if hot_reload is not None or record is not None:
-        require_running(cell)
+    if hot_reload is not None:
+        check_hot_reload(cell, hot_reload == "on")
+    if record is not None:
+        checked_record(cell, record)
     done = _changes(bus, scope, cell, hot_reload, record, flags, force)
     return print_outcomes(Outcome(cell, f"{one}: {cell.uuid} ({cell.name})") for one in done)
 

@@ -25,7 +25,7 @@ from dora_systemd.verbs.facts.locks import require_uninhibited
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import ask_coordinator
-from dora_systemd.verbs.reload import reload_cell, switch_hot_reload
+from dora_systemd.verbs.reload import check_hot_reload, reload_cell, switch_hot_reload
 from dora_systemd.verbs.restart import act_on, told
 from dora_systemd.verbs.set import set_limits
 from dora_systemd.verbs.start.enable import disable_cell, enable_cell
@@ -153,6 +153,8 @@ def _set(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> st
     _refuse_on_trial(scope, cell, "set")
     limits, switch = dict(message.values), message.values.get(HOT_RELOAD)
     limits.pop(HOT_RELOAD, None)
+    if switch is not None:
+        check_hot_reload(cell, switch == "on")
     done: list[str] = []
     if limits or switch is None:
         warnings = set_limits(manager, scope, cell, limits)

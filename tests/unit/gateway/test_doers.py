@@ -200,6 +200,16 @@ def test_the_page_sets_limits(
     assert asked[-1] == {"verb": "hot-reload", "on": False}
 
 
+def test_the_page_changes_nothing_if_a_part_cannot_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (fake_cgroups(monkeypatch, tmp_path) / "cgroup.controllers").write_text("memory")
+    bench = Bench(tmp_path, monkeypatch, active="failed")
+    with pytest.raises(DoraSystemdError, match="robot: it is not running"):
+        bench.change("set", memory_limit="6G", hot_reload="off")
+    assert bench.manager.calls == []
+
+
 def test_the_page_reloads(bench: Bench) -> None:
     _run(bench, "run")
     with fake_runner(bench.scope.cell_directory("robot")) as asked:
