@@ -33,7 +33,7 @@ from dora_systemd.decisions.settings.table import (
 from dora_systemd.errors import DoraSystemdError, bad_input, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file, unreadable
-from dora_systemd.trust.paths import Place, reached, user_name
+from dora_systemd.trust.paths import Place, reached, refusal, user_name
 from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.trust.sight import Sight, cannot_reach
 from dora_systemd.values import quoted, shown
@@ -247,6 +247,9 @@ def _read_lent(file: str, sight: Sight) -> str:
     """An environment file of the user's own settings, read with that user's permissions."""
     try:
         return decoded(sight.read(file), Path(file))
+    except PermissionError as error:
+        hint = "let the user that the dataflow runs as read it"
+        raise refusal(file, "permission denied", hint) from error
     except OSError as error:
         raise unreadable(file, error) from error
 

@@ -1,6 +1,7 @@
 """What a start finds on the machine."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -59,3 +60,19 @@ def test_a_link_of_another_user_to_variables_of_root(tmp_path: Path) -> None:
     file.symlink_to(secret)
     with pytest.raises(DoraSystemdError, match="is a symbolic link that users other than root"):
         given_variables(settings, Sight())
+
+
+class OthersSight(Sight):
+    """The sight of an account that can read nothing."""
+
+    def read(self, path: str) -> bytes:
+        raise PermissionError(13, "Permission denied", path)
+
+
+def test_who_must_be_able_to_read_an_environment_file() -> None:
+    """The caller is root, who can; it is read as the user of the dataflow, for whom it is not."""
+    settings = resolve_settings({"env_file": ("/srv/vars",)}, {}, ())
+    lent = replace(settings, lent=frozenset({"/srv/vars"}))
+    with pytest.raises(DoraSystemdError, match="/srv/vars: permission denied") as caught:
+        given_variables(lent, OthersSight())
+    assert caught.value.hint == "let the user that the dataflow runs as read it"
