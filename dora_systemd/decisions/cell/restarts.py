@@ -114,8 +114,7 @@ def parse_window(text: str) -> int:
     """µs after which something is reset or given up. Raises DoraSystemdError (USAGE)."""
     window = parse_duration(text)
     if window == 0:
-        message = f"cannot use {quoted(text)} as the window of restarts"
-        raise usage_error(message, "write a time such as 10min")
+        raise usage_error(f"cannot use a time of {quoted(text)}", "write a time such as 10min")
     return window
 
 

@@ -132,9 +132,9 @@ def _check_grace(settings: Settings, read: SettingsFile) -> None:
     if settings.source(GRACE_DURATION) != str(read.path) or time <= limit:
         return
     grace = format_duration(settings[GRACE_DURATION])
+    end = f"be killed after {format_duration(time)}" if time < INFINITY else "never be killed"
     message = (
-        f"cannot use grace_duration {grace} in {shown(str(read.path))}: nodes would be killed"
-        f" {'never' if time >= INFINITY else f'after {format_duration(time)}'},"
+        f"cannot use grace_duration {grace} in {shown(str(read.path))}: nodes would {end},"
         f" and stop_limit is {format_duration(limit)}"
     )
     hint = f"lower it, or root raises {STOP_LIMIT.flags[0]} or stop_limit in {SYSTEM_FILE}"

@@ -402,7 +402,7 @@ def test_a_grace_duration_of_others_is_within_stop_limit(project: Path) -> None:
     assert "--stop-limit" in caught.value.hint
     assert caught.value.code is ExitCode.BAD_INPUT
     beside.write_text("grace_duration: infinity")
-    with pytest.raises(DoraSystemdError, match="would be killed never"):
+    with pytest.raises(DoraSystemdError, match="would never be killed"):
         settings(SYSTEM, flow)
     beside.write_text("grace_duration: 200s")
     settings(SYSTEM, flow)
