@@ -29,7 +29,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.start.check import check_plan
+from dora_systemd.verbs.start.check import check_plan, check_unit
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.logins import ensure_linger, has_run_here, logout_note, start_notes
 from dora_systemd.verbs.start.needs import held_notes, waiting_notes
@@ -127,6 +127,7 @@ def _print_unit(scope: Scope, request: StartRequest, want_boot: bool) -> ExitCod
     target = boot_target(connect(), scope) if want_boot else None
     plan = make_plan(scope, request)
     check_plan(connect, plan)
+    check_unit(connect, plan)
     write_exactly(format_plan(plan, connect, target))
     return ExitCode.OK
 

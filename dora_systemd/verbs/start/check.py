@@ -50,6 +50,17 @@ def check_plan(connect: Callable[[], Manager], plan: Plan) -> dict[str, str]:
     return parse_versions(done.stdout)
 
 
+def check_unit(connect: Callable[[], Manager], plan: Plan) -> None:
+    """Raise DoraSystemdError for what systemd cannot do at a start, if it can be reached."""
+    if os.geteuid() == 0:
+        return  # check_plan() starts a unit with these properties
+    try:
+        manager = connect()
+    except DoraSystemdError:
+        return
+    plan_properties(plan, manager)
+
+
 def run_beside(connect: Callable[[], Manager], plan: Plan, command: Sequence[str]) -> Completed:
     """Run a command as the runner of `plan` would. Raises DoraSystemdError if that fails."""
     if os.geteuid() != 0:

@@ -3,9 +3,9 @@
 import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.start.check import check_plan
+from dora_systemd.verbs.start.check import check_plan, check_unit
 from tests.unit.fakes.manager import PrintingManager
-from tests.unit.verbs.start.test_start_unit import make_plan
+from tests.unit.verbs.start.test_start_unit import make_plan, no_manager
 
 
 @pytest.fixture(autouse=True)
@@ -53,3 +53,13 @@ def test_a_check_that_cannot_be_made(status: int) -> None:
 def test_the_versions_of_a_check() -> None:
     manager = PrintingManager(b"versions: dora=1.1.0 python=3.13.5\n")
     assert check_plan(lambda: manager, make_plan()) == {"dora": "1.1.0", "python": "3.13.5"}
+
+
+def test_a_dry_run_of_a_user_refuses_what_systemd_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without root the check is no unit, so nothing else compares the plan with systemd."""
+    manager, plan = PrintingManager(), make_plan(needs=("network",))
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    with pytest.raises(DoraSystemdError, match="it needs network: a user's manager does not"):
+        check_unit(lambda: manager, plan)
+    check_unit(no_manager, plan)
+    assert manager.calls == []
