@@ -16,7 +16,7 @@ from dora_systemd.decisions.cell.options import (
     changed,
     parse_setting,
 )
-from dora_systemd.decisions.cell.owes import RESTART
+from dora_systemd.decisions.cell.owes import RESTART, policies_of
 from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.settings.kinds import Base, Setting, texts_of
 from dora_systemd.decisions.settings.nodes import NODES, Nodes
@@ -31,7 +31,7 @@ from dora_systemd.decisions.settings.table import (
     SETTINGS,
     UV,
 )
-from dora_systemd.errors import DoraSystemdError, WrongKey, usage_error
+from dora_systemd.errors import DoraSystemdError, WrongKey, bad_input, usage_error
 from dora_systemd.values import shown
 
 T = TypeVar("T")
@@ -233,7 +233,7 @@ def _merged(setting: Setting[Any], given: Sequence[Given]) -> Given:
 
 def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
     """The options, with those that are settings. Raises DoraSystemdError."""
-    return options._replace(
+    given = options._replace(
         uv=settings[UV],
         debug=settings[DEBUG],
         allow_shell_nodes=settings[ALLOW_SHELL_NODES],
@@ -242,6 +242,20 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         start_timeout=settings[START_TIMEOUT],
         settings=changed(tuple(runner_texts(settings, options.working_directory)), settings.passed),
     )
+    try:
+        policies_of(given)
+    except DoraSystemdError as error:
+        raise _of_files(settings, error) from error
+    return given
+
+
+def _of_files(settings: Settings, error: DoraSystemdError) -> DoraSystemdError:
+    """The error about restarts; it names the settings files if nothing else has set them."""
+    keys = {*(one.name for one in POLICY_SETTINGS), NODES} & settings.sources.keys()
+    sources = {one for key in keys for one in settings.sources[key].split(", ")} - {DEFAULT_SOURCE}
+    if not all(one.startswith("/") for one in sources):
+        return error
+    return bad_input(f"{error.message} ({', '.join(map(shown, sorted(sources)))})", error.hint)
 
 
 def runner_texts(settings: Settings, directory: str | None = None) -> Iterator[SettingText]:

@@ -31,11 +31,12 @@ from tests.unit.decisions.cell.test_launch import plan
 from tests.unit.fakes.manager import options, with_restart
 
 MINUTE = 60 * SECOND
+FILE = "/srv/robot.systemd.yml"
 POLICY = RestartPolicy("on-failure", 3, 10 * MINUTE, SECOND, 8 * SECOND)
 
 
 def settings(flags: dict[str, object], document: object = None) -> Settings:
-    return resolve_settings(flags, {}, [("robot.systemd.yml", document)])
+    return resolve_settings(flags, {}, [(FILE, document)])
 
 
 def runner(given: Settings) -> RunnerOptions:
@@ -174,6 +175,7 @@ def test_bad_values(name: str, text: str) -> None:
         settings({name: text})
     assert caught.value.code is ExitCode.USAGE
     assert caught.value.message.startswith("cannot ")
+    assert ("restart" in caught.value.message) == (name != "start_timeout")
     assert caught.value.hint
 
 
@@ -204,11 +206,17 @@ def test_a_restart_at_once(given: dict[str, object], delay: int) -> None:
 )
 @pytest.mark.parametrize("is_node", [False, True])
 def test_a_crash_loop_that_would_not_end(given: dict[str, object], is_node: bool) -> None:
-    options = runner(settings({}, {"nodes": {"camera": given}} if is_node else given))
+    document = {"nodes": {"camera": given}} if is_node else given
     with pytest.raises(DoraSystemdError, match=r"^cannot use restart_delay") as caught:
-        policies_of(options)
+        runner(settings({}, document))
     assert ("of the node 'camera'" in caught.value.message) == is_node
-    assert (caught.value.code, "500ms or more" in str(caught.value.hint)) == (ExitCode.USAGE, True)
+    assert "500ms or more" in caught.value.hint
+    assert FILE in caught.value.message
+    assert caught.value.code is ExitCode.BAD_INPUT
+    with pytest.raises(DoraSystemdError, match=r"^cannot use restart_delay") as caught:
+        runner(settings({"max_restart_delay": "1min"}, document))
+    assert FILE not in caught.value.message
+    assert caught.value.code is ExitCode.USAGE
 
 
 def node(raw: dict[str, Any], policy: RestartPolicy = DEFAULT, ident: str = "") -> dict[str, Any]:
