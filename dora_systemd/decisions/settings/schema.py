@@ -80,7 +80,7 @@ def validation_error(
     settings = {setting.name: setting for setting in table}
     if first["type"] in _UNKNOWN:
         near = did_you_mean(place[-1], _known(place, table))
-        hint = near or "dora-systemd.yml(5) lists the keys"
+        hint = _other_place(place, settings) or near or "dora-systemd.yml(5) lists the keys"
         owner = f" of node {quoted(place[1])}" if len(place) > 2 and place[0] == "nodes" else ""
         reason = f"unknown key {quoted(place[-1])}{owner}"
     else:
@@ -92,6 +92,14 @@ def validation_error(
         reason = f"the value of {key} is of another type"
     refused = refusal(source, reason, hint)
     return WrongKey(refused.message, refused.hint, source, place)
+
+
+def _other_place(place: Sequence[str], settings: Mapping[str, Setting[Any]]) -> str:
+    """Where a key belongs that is only for nodes, or only for the dataflow; "" for other keys."""
+    setting = settings.get(place[-1])
+    if setting is None:
+        return ""
+    return f"write {setting.name} {'below' if setting.only_nodes else 'outside of'} nodes:"
 
 
 def _entry(place: Sequence[str]) -> str:

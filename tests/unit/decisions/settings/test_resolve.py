@@ -161,6 +161,12 @@ def test_a_numeric_user_is_a_text() -> None:
         ("text", "it is not a mapping", "mapping"),
         ({"grace_duratoin": 1}, "unknown key 'grace_duratoin'", "did you mean grace_duration?"),
         ({"grace-duration": 1}, "unknown key 'grace-duration'", "did you mean grace_duration?"),
+        ({"essential": True}, "unknown key 'essential'", "write essential below nodes:"),
+        (
+            {"nodes": {"a": {"uv": True}}},
+            "unknown key 'uv' of node 'a'",
+            "write uv outside of nodes:",
+        ),
         ({"zzzzzz": 1}, "unknown key 'zzzzzz'", "dora-systemd.yml(5)"),
         ({1: 2}, "a key in it is int, not text", "quotes"),
         ({"uv": [1]}, "the value of uv is of another type", "yes or no"),
