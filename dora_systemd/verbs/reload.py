@@ -18,8 +18,15 @@ from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.environment import changes_entry, changes_of, with_changes
 from dora_systemd.decisions.cell.line_rates import RateLimits, rate_texts, rates_of
 from dora_systemd.decisions.cell.options import SettingText, changed, format_setting
+from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.assignments import typed
-from dora_systemd.decisions.recorder.record import Record, format_record, parse_record
+from dora_systemd.decisions.recorder.record import (
+    Record,
+    check_memory,
+    check_record,
+    format_record,
+    parse_record,
+)
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import usage_error
 from dora_systemd.names import release_of
@@ -27,6 +34,8 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import format_bool
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.node import patient, require_node, require_running, socket_of
+from dora_systemd.verbs.start.limits import read_machine
+from dora_systemd.verbs.start.read import written_dataflow
 
 Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
@@ -91,7 +100,14 @@ def checked_record(cell: Cell, text: str) -> Record | None:
     """What to record, from the text of the setting. Raises DoraSystemdError."""
     require_running(cell)
     refuse_parts([cell], "set")
-    return parse_record(text)
+    record = parse_record(text)
+    if record is not None and not cell.options.has("record"):
+        # There is no recorder yet that would refuse it, but the next start does.
+        check_memory(record, read_machine().memory)
+        nodes = written_dataflow(cell.options.dataflow).nodes
+        if not any(node.kind in UNEXPANDED for node in nodes):
+            check_record(record, cell.options, nodes)
+    return record
 
 
 @contextmanager

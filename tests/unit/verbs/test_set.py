@@ -55,6 +55,13 @@ class Place:
             Environment=["PATH=/bin"],
         )
 
+    def has_file(self) -> None:
+        """Let the dataflow be in a file."""
+        file = self.root / "robot.yml"
+        file.write_text("nodes: [{id: camera, path: camera.py, outputs: [image]}]")
+        command = runner_command("/usr/bin/python3", options(dataflow=str(file)))
+        self.manager.units[self.unit]["ExecStart"][0][1] = command
+
     def offer(self, group: Path, controllers: str) -> None:
         (group / "cgroup.controllers").write_text(controllers)
 
@@ -161,11 +168,26 @@ def test_a_release_has_no_hot_reload(place: Place) -> None:
 def test_a_recorder_that_was_not_started_needs_a_restart(
     place: Place, text: str, warns: bool
 ) -> None:
+    place.has_file()
     found = switch_record(place.manager, place.scope, place.cell, text, lambda *_: {})
     what = "was started without record, and records from its restart on"
     expected = (f"{place.cell.name} {what}: doractl restart {place.cell.name}",)
     assert found == (expected if warns else ())
     assert "record=" in place.drop_in.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [("outputs=camera/sound", "'camera/sound': no such output"), ("memory=9999T", "9999T")],
+)
+def test_a_recorder_that_could_not_start_is_refused_now(
+    place: Place, text: str, problem: str
+) -> None:
+    """Else the next restart would fail, and end the dataflow."""
+    place.has_file()
+    with pytest.raises(DoraSystemdError, match=problem):
+        switch_record(place.manager, place.scope, place.cell, text, lambda *_: {})
+    assert not place.drop_in.exists()
 
 
 def test_what_is_too_small_or_too_large_is_said(place: Place) -> None:
