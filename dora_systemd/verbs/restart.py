@@ -13,6 +13,8 @@ from dora_systemd.adapters.runner_socket.client import ask_refusal
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import exists
+from dora_systemd.values import shown
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.containers import find_outside, with_left
 from dora_systemd.verbs.facts.locks import uninhibited
@@ -39,7 +41,7 @@ def restart_cells(
     restart, for the journal. The restart resets the counter of automatic restarts.
     """
     thawed = {cell for cell in cells if manager.thaw(cell.unit)}  # a frozen runner answers nothing
-    refused = {} if is_forced else find_refusals(scope, cells, ask)
+    refused = {} if is_forced else find_refusals(manager, scope, cells, ask)
     chosen = [cell for cell in cells if cell not in refused]
     note_stop(chosen, by)
     for cell in chosen:
@@ -57,7 +59,7 @@ def restart_cells(
 
 
 def find_refusals(
-    scope: Scope, cells: Sequence[Cell], ask: Ask = ask_refusal
+    manager: Manager, scope: Scope, cells: Sequence[Cell], ask: Ask = ask_refusal
 ) -> Mapping[Cell, DoraSystemdError]:
     """The running dataflows that could not start again, each with the error of its start.
 
@@ -65,6 +67,8 @@ def find_refusals(
     """
     running = [cell for cell in cells if cell.has_begun]
     others = {cell: _other_version(cell) for cell in running if _is_of_other_version(cell)}
+    lost = {cell: error for cell in running if (error := _lost_credential(manager, cell))}
+    others = lost | others
     asked = [
         (cell, beside(partial(_find_refusal, scope, cell, ask)))
         for cell in running
@@ -84,9 +88,19 @@ def _other_version(cell: Cell) -> DoraSystemdError:
     return bad_input(message, hint)
 
 
-def require_startable(scope: Scope, cell: Cell, ask: Ask = ask_refusal) -> None:
+def _lost_credential(manager: Manager, cell: Cell) -> DoraSystemdError | None:
+    """The error for a credential whose file is not there any more: systemd reads it at a start."""
+    given = manager.read(cell.unit, ["LoadCredential"])["LoadCredential"] or ()
+    for name, file in given:
+        if file.startswith("/") and not exists(file):
+            message = f"cannot use {shown(file)} as credential {name}: there is no such file"
+            return _kept(cell, bad_input(message, "put it back"))
+    return None
+
+
+def require_startable(manager: Manager, scope: Scope, cell: Cell, ask: Ask = ask_refusal) -> None:
     """Raise the error that a start of a running dataflow would end with."""
-    for error in find_refusals(scope, [cell], ask).values():
+    for error in find_refusals(manager, scope, [cell], ask).values():
         raise error
 
 
@@ -95,8 +109,11 @@ def _find_refusal(scope: Scope, cell: Cell, ask: Ask) -> DoraSystemdError | None
         error = ask(socket_of(scope, cell))
     except DoraSystemdError:
         return None
-    if error is None:
-        return None
+    return error and _kept(cell, error)
+
+
+def _kept(cell: Cell, error: DoraSystemdError) -> DoraSystemdError:
+    """The error, with what has become of the dataflow in its hint."""
     goes_on = f"{cell.name} keeps running; doractl restart --force {cell.name} restarts it anyway"
     hint = f"{error.hint}, ".replace("?,", "?") if error.hint else ""
     return DoraSystemdError(error.message, f"{hint}{goes_on}", error.code)

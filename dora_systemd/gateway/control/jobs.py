@@ -156,12 +156,16 @@ async def restart(talk: Talk, request: Request) -> dict[str, Any]:
         # Before the time of `_within` begins, which ends in a kill.
         await asyncio.to_thread(_hold, held, scope, cell)
         await asyncio.to_thread(refuse_parts, [cell], "restart")
-        await asyncio.to_thread(require_startable, scope, cell)
+        await asyncio.to_thread(_require_startable, scope, cell)
         outcome = await _within(scope, cell, request, lambda: _restart(scope, cell))
     if outcome.problem:
         hint = outcome.hint or f"doractl {scope.flag} why {cell.name} shows more"
         raise DoraSystemdError(outcome.problem, hint)
     return {"DataflowRestarted": {"old_uuid": cell.uuid, "new_uuid": cell.uuid}}
+
+
+def _require_startable(scope: Scope, cell: Cell) -> None:
+    require_startable(Bus(scope), scope, cell)
 
 
 def _note_stop(scope: Scope, cell: Cell) -> None:

@@ -112,6 +112,21 @@ def test_what_could_not_start_again_keeps_running(manager: FakeManager) -> None:
     assert [call for call in manager.calls if UNIT in call] == []
 
 
+def test_a_credential_that_is_not_there_any_more(manager: FakeManager, tmp_path: Path) -> None:
+    """Only systemd reads it, so the runner cannot say that the next start would fail."""
+    (tmp_path / "key").write_text("x")
+    lost = f"{tmp_path}/token"
+    manager.units[UNIT]["LoadCredential"] = [["a", f"{tmp_path}/key"], ["store", "x"]]
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
+    assert outcome.text
+    manager.calls.clear()
+    manager.units[UNIT]["LoadCredential"].append(["b", lost])
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
+    assert outcome.problem == f"cannot use {lost} as credential b: there is no such file"
+    assert outcome.hint.startswith("put it back, robot keeps running; doractl restart --force")
+    assert [call for call in manager.calls if UNIT in call] == []
+
+
 @pytest.mark.parametrize("change", ["forced", "failed"])
 def test_what_is_not_asked(manager: FakeManager, change: str) -> None:
     """Nothing is lost by the restart of what does not run."""
@@ -123,9 +138,9 @@ def test_what_is_not_asked(manager: FakeManager, change: str) -> None:
 
 def test_the_same_as_an_exception(manager: FakeManager) -> None:
     (cell,) = read_cells(manager)
-    require_startable(SCOPE, cell, accept)
+    require_startable(manager, SCOPE, cell, accept)
     with pytest.raises(DoraSystemdError, match="it is odd") as caught:
-        require_startable(SCOPE, cell, refuse)
+        require_startable(manager, SCOPE, cell, refuse)
     assert caught.value.code is ExitCode.BAD_INPUT
 
 
