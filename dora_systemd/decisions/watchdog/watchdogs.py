@@ -63,9 +63,10 @@ def check_watchdogs(watchdogs: Watchdogs, launched: Container[str]) -> None:
     """
     for node, limit in watchdogs.items():
         if node and limit and node not in launched:
-            message = f"cannot watch the node {node}: dora itself starts it, without a socket"
+            message = f"cannot give the node {node} a notify socket: dora itself starts it"
             hint = (
-                "operators, dynamic nodes and nodes of ROS 2 or with path_sha256 have no watchdog"
+                "operators, dynamic nodes and nodes of ROS 2 or with path_sha256 have none, so no"
+                " watchdog, notify or stop: within either"
             )
             raise bad_input(message, hint)
 

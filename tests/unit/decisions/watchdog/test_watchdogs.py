@@ -73,5 +73,5 @@ def test_the_time_of_one_node() -> None:
 
 def test_nodes_that_cannot_have_one() -> None:
     check_watchdogs({ALL_NODES: SECOND, "cam": SECOND, "op": OFF}, ["cam"])
-    with pytest.raises(DoraSystemdError, match="node op: dora itself starts it"):
+    with pytest.raises(DoraSystemdError, match="give the node op a notify socket: dora itself"):
         check_watchdogs({"op": INFINITY}, ["cam", "lidar"])
