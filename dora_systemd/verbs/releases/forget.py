@@ -93,7 +93,8 @@ def _require_unused(standing: Standing, name: str) -> None:
     if standing.running or standing.trial:
         message, hint = f"cannot forget {name}: it is running", f"doractl stop {name}"
     elif standing.boot.text is not None or standing.boot.is_wanted:
-        message, hint = f"cannot forget {name}: it is enabled", f"doractl disable {name}"
+        reason = "it is enabled" if standing.boot.is_wanted else "its unit file is kept"
+        message, hint = f"cannot forget {name}: {reason}", f"doractl disable {name}"
     else:
         return
     raise DoraSystemdError(message, f"{hint}, then repeat this command", ExitCode.NAME_IN_USE)

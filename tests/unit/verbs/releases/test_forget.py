@@ -38,8 +38,16 @@ def test_all_that_is_kept(robot: Robot) -> None:
 
 def test_what_runs_or_is_enabled_stays(robot: Robot) -> None:
     robot.run(A)
-    for reason, hint in (("is running", "doractl stop robot"), ("is enabled", "doractl disable")):
-        with pytest.raises(DoraSystemdError, match=f"cannot forget robot: it {reason}") as caught:
+    wanted = robot.unit_file.parent / "default.target.wants" / UNIT
+    wanted.parent.mkdir()
+    for reason, hint in (
+        ("it is running", "doractl stop robot"),
+        ("its unit file is kept", "doractl disable"),
+        ("it is enabled", "doractl disable"),
+    ):
+        if reason == "it is enabled":
+            wanted.symlink_to(robot.unit_file)
+        with pytest.raises(DoraSystemdError, match=f"cannot forget robot: {reason}") as caught:
             find_kept(robot.manager, robot.scope, "robot")
         assert hint in caught.value.hint
         assert caught.value.code == ExitCode.NAME_IN_USE
