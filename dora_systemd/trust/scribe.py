@@ -25,11 +25,11 @@ def replace_text(path: str, before: bytes, after: bytes) -> None:
     parent = os.open(directory or "/", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     temporary = f".{name}.{os.urandom(4).hex()}"
     try:
-        mode = _checked(parent, name, before)
+        mode, group = _checked(parent, name, before)
         fd = os.open(temporary, _NEW, 0o600, dir_fd=parent)
         try:
             with os.fdopen(fd, "wb") as file:
-                os.fchmod(fd, mode)
+                _give(fd, mode, group)
                 file.write(after)
                 file.flush()
                 os.fsync(fd)
@@ -42,21 +42,31 @@ def replace_text(path: str, before: bytes, after: bytes) -> None:
         os.close(parent)
 
 
-def _checked(parent: int, name: str, before: bytes) -> int:
-    """The mode of the file. Raises OSError if it is not as it was read."""
+def _give(fd: int, mode: int, group: int) -> None:
+    """Give a new file the mode and the group of the file that it replaces."""
+    try:
+        os.fchown(fd, -1, group)
+    except OSError:
+        # Its owner is not in that group. Another group gets no more than all users have.
+        mode = mode & ~stat.S_IRWXG | (mode & stat.S_IRWXO) << 3
+    os.fchmod(fd, mode)
+
+
+def _checked(parent: int, name: str, before: bytes) -> tuple[int, int]:
+    """The mode and the group of the file. Raises OSError if it is not as it was read."""
     try:
         fd = os.open(name, _READ, dir_fd=parent)
     except FileNotFoundError:
         if before:
             raise
-        return _NEW_MODE
+        return _NEW_MODE, -1
     with os.fdopen(fd, "rb", buffering=0) as file:
         status = os.fstat(fd)
         if not stat.S_ISREG(status.st_mode):
             raise OSError(0, "it is not a regular file")
         if file.read(len(before) + 1) != before:
             raise OSError(0, _CHANGED)
-        return stat.S_IMODE(status.st_mode)
+        return stat.S_IMODE(status.st_mode), status.st_gid
 
 
 def main(path: str) -> None:

@@ -13,6 +13,7 @@ from dora_systemd.trust.scribe import replace_text
 from tests.unit.trust.test_sight import OTHER, can_run_python
 
 OWN = os.geteuid()
+FOREIGN_GROUP = 54321
 
 
 @pytest.fixture(params=["own", "other"])
@@ -35,7 +36,7 @@ def place(owner: int) -> Iterator[Path]:
 def make(path: Path, data: bytes, owner: int, mode: int = 0o640) -> Path:
     path.write_bytes(data)
     path.chmod(mode)
-    os.chown(path, owner, -1)
+    os.chown(path, owner, OTHER.gid if owner == OTHER.uid else -1)
     return path
 
 
@@ -46,6 +47,18 @@ def test_a_file_is_replaced(place: Path, owner: int) -> None:
     assert path.read_bytes() == b"new" * 50_000
     assert (found.st_uid, found.st_mode & 0o7777) == (owner, 0o640)
     assert [one.name for one in place.iterdir()] == ["ä"]
+
+
+@pytest.mark.skipif(OWN != 0, reason="only root can give a file any group")
+def test_the_group_stays_or_gets_no_more_than_all_users(place: Path, owner: int) -> None:
+    """Only root may give a file to a group in which the owner is not."""
+    path = make(place / "a", b"old", owner, 0o664)
+    os.chown(path, -1, FOREIGN_GROUP)
+    replace_file(str(path), b"old", b"new", owner)
+    found = path.stat()
+    is_kept = found.st_gid == FOREIGN_GROUP
+    assert is_kept == (owner == OWN)
+    assert found.st_mode & 0o7777 == (0o664 if is_kept else 0o644)
 
 
 def test_a_file_is_created(place: Path, owner: int) -> None:
