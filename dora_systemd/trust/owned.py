@@ -5,6 +5,7 @@ another user a child process of that user writes, see scribe.py. If that user ha
 another file there meanwhile, only that user's own files are at stake.
 """
 
+import errno
 import os
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from dora_systemd.trust.sight import receive, send
 from dora_systemd.values import shown
 
 _SECONDS = 30.0
+_REFUSALS = (os.strerror(errno.EACCES), os.strerror(errno.EPERM))
 _LONGEST = 200
 """Maximum bytes of a reason: that user can send any text, which the edge of doractl escapes."""
 
@@ -56,4 +58,5 @@ def _as_user(path: str, before: bytes, after: bytes, owner: int) -> None:
     finally:
         end_child(child)
     if reason:
-        raise OSError(0, reason.decode("utf-8", "replace"))
+        text = reason.decode("utf-8", "replace")
+        raise (PermissionError if text in _REFUSALS else OSError)(0, text)

@@ -4,6 +4,7 @@ owned.py calls replace_text() for the caller. For another user, owned.py has a c
 user run the text of this file.
 """
 
+import errno
 import os
 import stat
 import sys
@@ -60,6 +61,10 @@ def _checked(parent: int, name: str, before: bytes) -> tuple[int, int]:
         if before:
             raise
         return _NEW_MODE, -1
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(0, "it is a symbolic link") from error
+        raise
     with os.fdopen(fd, "rb", buffering=0) as file:
         status = os.fstat(fd)
         if not stat.S_ISREG(status.st_mode):

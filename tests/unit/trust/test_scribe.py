@@ -83,8 +83,8 @@ def test_no_link_and_no_device_is_followed(place: Path, owner: int) -> None:
     (place / "link").symlink_to(target)
     os.mkfifo(place / "pipe")
     os.chown(place / "pipe", owner, -1)
-    for name in ("link", "pipe"):
-        with pytest.raises(DoraSystemdError, match="cannot write"):
+    for name, what in (("link", "a symbolic link"), ("pipe", "not a regular file")):
+        with pytest.raises(DoraSystemdError, match=f"cannot write .*: it is {what}"):
             replace_file(f"{place}/{name}", b"old", b"x", owner)
     assert target.read_bytes() == b"old"
 
@@ -96,8 +96,9 @@ def test_root_lends_no_permission() -> None:
         os.chown(name, 0, 0)
         Path(name).chmod(0o755)
         path = make(Path(name, "settings"), b"old", 0, 0o644)
-        with pytest.raises(DoraSystemdError, match="Permission denied"):
+        with pytest.raises(DoraSystemdError, match="Permission denied") as caught:
             replace_file(str(path), b"old", b"x", OTHER.uid)
+        assert caught.value.code == ExitCode.NO_PERMISSION
         assert path.read_bytes() == b"old"
         with pytest.raises(DoraSystemdError, match="Permission denied"):
             replace_file(f"{name}/new", b"", b"x", OTHER.uid)
