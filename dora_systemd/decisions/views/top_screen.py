@@ -29,6 +29,7 @@ A row is a dataflow, or one of its nodes. R and S ask first.
 
 _HINT = "q quit  ? help  R restart  S stop  c m n sort  r reverse"
 _BACK = "Any key goes back."
+_CONFIRM = "? y/n"
 _SORT_KEYS = {sort[0]: sort for sort in SORTS}
 _ACTIONS = {"R": "restart", "S": "stop"}
 _FRAME = 3
@@ -126,7 +127,7 @@ class TopScreen:
         header, *body = self._body(columns)
         title = Line(f"{local_time(self._look.at_us)[-8:]}  {format_summary(self._look)}")
         gap = [Line("")] * (self._room - len(body))
-        lines = [title, header, *body, *gap, self._last_line()]
+        lines = [title, header, *body, *gap, self._last_line(columns)]
         # A low terminal does without the title, and then without the header.
         return [Line(cut(text, columns), style) for text, style in lines[-height:]]
 
@@ -151,9 +152,9 @@ class TopScreen:
             Line(text.ljust(columns), f"{style} reverse") if at == self._at else Line(text, style)
         )
 
-    def _last_line(self) -> Line:
+    def _last_line(self, columns: int) -> Line:
         if self._asked:
-            return Line(f"{self._asked}? y/n", "bold")
+            return Line(cut(str(self._asked), columns - len(_CONFIRM)) + _CONFIRM, "bold")
         if self._wants_help:
             return Line(_BACK)
         if self.said:

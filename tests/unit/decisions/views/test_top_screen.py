@@ -71,6 +71,13 @@ def test_it_scrolls_with_the_selected_row() -> None:
     assert texts(screen, height=height)[-1].startswith("4-5/5  ")
 
 
+def test_a_question_is_one_on_a_narrow_terminal() -> None:
+    screen = screen_of(ARM)
+    press(screen, "S")
+    assert texts(screen, columns=60)[-1] == f"Stop arm-{'x' * 45}…? y/n"
+    assert texts(screen, columns=200)[-1] == f"Stop arm-{'x' * 90}? y/n"
+
+
 def test_nothing_runs() -> None:
     screen = screen_of()
     assert NOTHING in texts(screen)
