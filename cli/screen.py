@@ -191,7 +191,7 @@ class Work(Thread):
             self._say(f"{self.change} ...")
             by = "doractl top"
             bus = Bus(self._scope)
-            cell = Selector(row.uuid).find(bus)
+            cell = Selector(row.uuid).find_present(bus, self._scope)
             self.result = act_on(
                 bus, self._scope, cell, row.node, action, by=by, on_stage=self._say_stage
             )

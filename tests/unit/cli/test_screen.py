@@ -19,6 +19,7 @@ import pytest
 from dora_systemd.cli.screen import Screen, Work
 from dora_systemd.decisions.views.top import TopRow
 from dora_systemd.decisions.views.top_screen import Change, TopScreen
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.library import fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
@@ -217,6 +218,7 @@ def test_a_terminal_that_terminfo_does_not_know() -> None:
     assert ENTER not in terminal.seen
 
 
+SCOPE = ScopeIn(is_user=True, uid=1000, root=Path("/nowhere"))
 ROBOT = TopRow(UUID, "robot", "", "Running", ())
 
 
@@ -234,8 +236,7 @@ class Woken:
 def said_about(change: Change, manager: FakeManager, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     fake_systemd(monkeypatch, manager)
     screen = Woken(TopScreen("cpu"))
-    scope = ScopeIn(is_user=True, uid=1000, root=Path("/nowhere"))
-    work = Work(scope, change, screen.view, cast(Screen, screen))
+    work = Work(SCOPE, change, screen.view, cast(Screen, screen))
     work.start()
     work.join()
     assert work.result == screen.said[-1]
@@ -248,6 +249,13 @@ def test_a_restart(monkeypatch: pytest.MonkeyPatch) -> None:
     said = said_about(Change("restart", ROBOT), manager, monkeypatch)
     assert said[0] == "Restart robot ..."
     assert said[-1] == f"Dataflow restarted: {UUID} (robot)"
+
+
+def test_what_has_ended_meanwhile_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    stopped = life_record("dataflow-stopped", 1_000_000, scope=SCOPE)
+    FakeJournal(monkeypatch, tmp_path).write(stopped)
+    said = said_about(Change("stop", ROBOT), FakeManager(), monkeypatch)
+    assert said[-1] == "doractl: cannot use the dataflow robot: it has ended"
 
 
 def test_an_error_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
