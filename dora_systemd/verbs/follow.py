@@ -124,7 +124,8 @@ def _with_cursor(query: LogQuery, cursor: Path) -> LogQuery:
         return query
     span = find_span(query)
     if span is None:
-        return replace(query, tail="0", grep="", cursor_file="")
+        # Without a cursor file journalctl would print "-- No entries --" at each step.
+        return replace(query, tail="0", grep="", cursor_file="", is_quiet=True)
     cursor.write_text(f"{span.cursor}\n")
     return replace(query, tail="", since=span.first, until=span.last, cursor_file="")
 

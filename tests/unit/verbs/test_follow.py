@@ -13,9 +13,12 @@ from dora_systemd.verbs.follow import (
     check_until_end,
     first_step,
     follow_steps,
+    follow_to_end,
     is_unit_up,
     next_step,
 )
+from tests.unit.fakes.journal import FakeJournal
+from tests.unit.fakes.library import fake_systemd
 from tests.unit.fakes.manager import FakeManager, options
 
 QUERY = LogQuery(Scope(is_user=False, uid=0), name="robot", is_follow=True)
@@ -100,6 +103,18 @@ def test_steps(tmp_path: Path) -> None:
     assert first_step(given, cursor).tail == "3"
     assert first_step(given, cursor).since == "5m"
     assert next_step(given, cursor, 0).grep == "x"
+
+
+def test_a_step_without_records_prints_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    FakeJournal(monkeypatch, tmp_path)
+    manager = FakeManager()
+    manager.add(options(), "inactive")
+    fake_systemd(monkeypatch, manager)
+    steps: list[LogQuery] = []
+    follow_to_end(replace(QUERY, since="5m"), steps.append)
+    assert [query_arguments(one)[:2] for one in steps] == [["--output=short", "--quiet"]]
 
 
 @pytest.mark.parametrize(
