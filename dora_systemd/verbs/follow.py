@@ -28,7 +28,7 @@ from dora_systemd.decisions.logs.query import (
     journal_timestamp,
     scope_matches,
 )
-from dora_systemd.errors import usage_error
+from dora_systemd.errors import ExitCode, usage_error
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.logs import Follower, find_span
@@ -93,10 +93,11 @@ def check_until_end(query: LogQuery) -> None:
         raise usage_error("cannot follow with the newest lines first", hint)
 
 
-def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) -> None:
+def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], int]) -> int:
     """Print the records of a query, step by step, until its unit has ended.
 
-    Raises DoraSystemdError.
+    print_query: returns the exit status of journalctl, 1 if --grep matches nothing. Returns the
+    lowest of all steps. Raises DoraSystemdError.
     """
     start_us = time.time_ns() // 1000
     bus = Bus(query.scope, for_reading=True)
@@ -104,8 +105,16 @@ def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) ->
         closing(UnitWatch(query.scope, query.name, start_us)) as watch,
         TemporaryDirectory(prefix="doractl-") as directory,
     ):
-        steps = _steps(query, Path(directory) / "cursor", start_us)
-        follow_steps(lambda: print_query(next(steps)), watch, lambda: is_unit_up(bus, query.name))
+        steps, found = _steps(query, Path(directory) / "cursor", start_us), set[int]()
+
+        def print_step() -> None:
+            step = next(steps)
+            status = print_query(step)
+            # A step for which nothing was found goes without --grep.
+            found.add(status if step.grep == query.grep else ExitCode.FAILURE)
+
+        follow_steps(print_step, watch, lambda: is_unit_up(bus, query.name))
+    return min(found)
 
 
 def _steps(query: LogQuery, cursor: Path, start_us: int) -> Iterator[LogQuery]:

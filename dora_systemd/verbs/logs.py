@@ -44,16 +44,20 @@ _LEFT_OUT = b" blob data]\n"
 
 
 def read_logs(
-    query: LogQuery, terminal: TerminalLines | ShownLines, want_colors: bool = False
+    query: LogQuery,
+    terminal: TerminalLines | ShownLines,
+    want_colors: bool = False,
+    on_end: Callable[[int], object] | None = None,
 ) -> Iterator[bytes]:
     """The output of journalctl for a query, in chunks, formatted by `terminal`.
 
-    Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not accept.
+    on_end: as for journal_output(). Raises DoraSystemdError: USAGE for a time or pattern that
+    journalctl does not accept.
     """
     # What commands a terminal is escaped here, so nothing need be left out.
     shown = replace(query, want_unprintable=True)
     arguments = query_arguments(_oldest_first(shown))
-    for data in journal_output(arguments, want_colors=want_colors):
+    for data in journal_output(arguments, want_colors, on_end):
         yield terminal.feed(data)
         if query.is_follow:
             yield terminal.flush()  # show received lines at once

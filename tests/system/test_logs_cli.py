@@ -289,7 +289,10 @@ class TestWhatIsShown:
         assert "systemd-journal" in done.stderr
 
     def test_no_entries(self, talks: Cell) -> None:
-        done = talks.doractl("logs", talks.name, "--grep", "never said", check=False)
+        words = ("logs", talks.name, "--grep", "never said")
+        with pytest.raises(AssertionError, match=": 1\n"):
+            shown("doractl", talks.scope.flag, *words, PAGER="cat")
+        done = talks.doractl(*words, check=False)
         assert "No entries" in done.stdout
         assert not done.stderr
         names = {record["DORA_EVENT"] for record in talks.journal() if "DORA_EVENT" in record}

@@ -194,12 +194,9 @@ def command(
         from dora_systemd.verbs.follow import check_until_end, follow_to_end
 
         check_until_end(query)
-        follow_to_end(query, lambda step: _print(step, lines))
-        return ExitCode.OK
-    if no_pager or query.is_follow or lines is None:
-        return _exit_status(_print(query, lines))
-    print_paged(read_logs(query, lines, wants_colors(sys.stdout)))
-    return ExitCode.OK
+        return _exit_status(follow_to_end(query, lambda step: _print(step, lines)))
+    is_paged = not (no_pager or query.is_follow)
+    return _exit_status(_print(query, lines, is_paged))
 
 
 def _require_end(until: str, is_follow: bool) -> None:
@@ -240,13 +237,21 @@ def _lines(journal: JournalReader, query: LogQuery) -> Lines:
     )
 
 
-def _print(query: LogQuery, lines: Lines) -> int:
-    """Print the records of a query, formatted for a terminal, or by journalctl itself."""
+def _print(query: LogQuery, lines: Lines, is_paged: bool = False) -> int:
+    """Print the records of a query, formatted for a terminal, or by journalctl itself.
+
+    Returns the exit status of journalctl; for a terminal, where a person may end it, 0 or 1.
+    """
     if lines is None:
         note = None if query.is_quiet else partial(print_warnings, [_LEFT_OUT])
         return pass_logs(query, sys.stdout.fileno(), note)
-    _write(read_logs(query, lines, wants_colors(sys.stdout)), sys.stdout.fileno())
-    return ExitCode.OK
+    status = list[int]()
+    chunks = read_logs(query, lines, wants_colors(sys.stdout), status.append)
+    if is_paged:
+        print_paged(chunks)
+    else:
+        _write(chunks, sys.stdout.fileno())
+    return ExitCode.FAILURE if status == [ExitCode.FAILURE] else ExitCode.OK
 
 
 def _exit_status(status: int) -> int:

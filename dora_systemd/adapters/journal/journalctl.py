@@ -6,7 +6,7 @@ in the time in which the Python binding reads 5,000.
 
 import os
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
@@ -71,13 +71,22 @@ def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
     return status
 
 
-def journal_output(arguments: Sequence[str], want_colors: bool = False) -> Iterator[bytes]:
-    """Yield the output of journalctl, in chunks. Raises DoraSystemdError for its error message."""
+def journal_output(
+    arguments: Sequence[str],
+    want_colors: bool = False,
+    on_end: Callable[[int], object] | None = None,
+) -> Iterator[bytes]:
+    """Yield the output of journalctl, in chunks. Raises DoraSystemdError for its error message.
+
+    on_end: called with its exit status, unless nobody reads to the end.
+    """
     with open_journalctl(arguments, want_colors) as child:
         assert child.stdout
         while data := os.read(child.stdout.fileno(), CHUNK):
             yield data
-        end_journalctl(child)
+        status = end_journalctl(child)
+        if on_end is not None:
+            on_end(status)
 
 
 def _complaint_error(complaint: str) -> DoraSystemdError:

@@ -113,8 +113,26 @@ def test_a_step_without_records_prints_nothing(
     manager.add(options(), "inactive")
     fake_systemd(monkeypatch, manager)
     steps: list[LogQuery] = []
-    follow_to_end(replace(QUERY, since="5m"), steps.append)
+
+    def print_query(step: LogQuery) -> int:
+        steps.append(step)
+        return 0
+
+    follow_to_end(replace(QUERY, since="5m"), print_query)
     assert [query_arguments(one)[:2] for one in steps] == [["--output=short", "--quiet"]]
+
+
+@pytest.mark.parametrize(("since", "status", "expected"), [("", 0, 0), ("", 1, 1), ("5m", 0, 1)])
+def test_a_pattern_that_nothing_matches(
+    since: str, status: int, expected: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """For --since it is known before a step is printed."""
+    FakeJournal(monkeypatch, tmp_path)
+    manager = FakeManager()
+    manager.add(options(), "inactive")
+    fake_systemd(monkeypatch, manager)
+    query = replace(QUERY, since=since, grep="x", tail="all")
+    assert follow_to_end(query, lambda _step: status) == expected
 
 
 @pytest.mark.parametrize(

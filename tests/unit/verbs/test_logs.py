@@ -248,7 +248,10 @@ def test_a_terminal_is_shown_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     """Escaped; without colours none of the nodes pass."""
     line = b"Nov 21 01:02:59 lab robot/a[1]: caf\xe9 \x1b[31mred\x1b[0m \x1b]2;x\x07\n"
     calls = fake_journalctl(monkeypatch, tmp_path, line)
-    shown = b"".join(read_logs(QUERY, TerminalLines(want_colors=False)))
+    status: list[int] = []
+    lines = read_logs(QUERY, TerminalLines(want_colors=False), on_end=status.append)
+    shown = b"".join(lines)
+    assert status == [0]
     assert shown == b"Nov 21 01:02:59 a caf\\xe9 red \\x1b]2;x\\x07\n"
     assert "--all" in calls.read_text().split()
 
