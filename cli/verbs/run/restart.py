@@ -57,7 +57,8 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
         if ended:
             from dora_systemd.verbs.start.start import restart_asked
 
-            outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]
+            given = (os.environ, stage, "doractl restart")
+            outcomes += [restart_asked(bus, scope, one, *given) for one in ended]
     done = [cell for cell, one in zip(cells, outcomes, strict=False) if not one.problem]
     print_warnings(version_warnings(bus, done))
     if any(one.problem for one in outcomes):

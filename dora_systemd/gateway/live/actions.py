@@ -120,7 +120,7 @@ def act(scope: Scope, message: PageMessage, manager: Manager | None = None) -> s
     if isinstance(known, Cell):
         return _ACTIONS[message.action](bus, scope, known, message)
     if message.action in ("start", "restart"):
-        return told(restart_asked(bus, scope, known, os.environ, None))
+        return told(restart_asked(bus, scope, known, os.environ, None, _BY))
     hint = f"doractl start {known.name}"
     raise DoraSystemdError(f"cannot {message.action} {known.name}: it has ended", hint)
 

@@ -78,14 +78,15 @@ def restart_asked(
     asked: Asked,
     environment: Mapping[str, str],
     on_stage: StageObserver | None,
+    by: str,
 ) -> Outcome:
     """Start what has ended once more, with the UUID and the settings it had, and wait for it.
 
-    environment: the caller's variables.
+    environment: the caller's variables. by: what requests the start, for the journal.
     """
     try:
         request = asked.request(StartRequest(asked.dataflow, environment=environment))
-        claimed = claim(manager, scope, request, "doractl restart")
+        claimed = claim(manager, scope, request, by)
         options = claimed.plan.options
         start_unit(manager, scope, options, claimed.properties, on_stage, True, claimed.links)
     except DoraSystemdError as error:

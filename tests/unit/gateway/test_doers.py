@@ -26,7 +26,7 @@ from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.library import FakeSystemd, fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
-from tests.unit.fakes.programs import make_program
+from tests.unit.fakes.programs import make_dora, make_program
 from tests.unit.fakes.runner import fake_runner
 from tests.unit.fakes.socket import FakeSocket
 
@@ -143,21 +143,39 @@ def test_the_page_starts_what_has_failed(tmp_path: Path, monkeypatch: pytest.Mon
     assert bench.jobs == ["RestartUnit"]
 
 
+def write_start(patch: pytest.MonkeyPatch, root: Path, flow: Path) -> None:
+    """A journal with the start of the dataflow arm, which has ended."""
+    record = {
+        "_PID": "7",
+        "_UID": str(os.getuid()),
+        "DORA_EVENT": "start-asked",
+        "DORA_SCOPE": "user",
+        "DORA_SETTINGS": "{}",
+        "DORA_DATAFLOW_NAME": "arm",
+        "DORA_DATAFLOW": NOBODY,
+        "DORA_FILE": str(flow),
+    }
+    FakeJournal(patch, root).write(record)
+
+
+def test_a_start_of_what_has_ended_says_who_asked(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_start(monkeypatch, tmp_path, tmp_path / "flow.yml")
+    make_dora(tmp_path / "bin" / "dora", "1.1.0")
+    make_program(tmp_path / "a.py")
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
+    message = PageMessage("act", NOBODY, action="start")
+    assert act(bench.scope, message, bench.manager) == f"Dataflow restarted: {NOBODY} (arm)"
+    (note,) = (one for one in bench.notes if b"start-asked" in one)
+    assert b"(status page)" in note
+
+
 def test_the_page_starts_what_has_ended(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flow = str(tmp_path / "gone.yml")
-    own = {"DORA_DATAFLOW_NAME": "arm", "DORA_DATAFLOW": NOBODY, "DORA_FILE": flow}
-    FakeJournal(monkeypatch, tmp_path).write(
-        {
-            "_PID": "7",
-            "_UID": str(os.getuid()),
-            "DORA_EVENT": "start-asked",
-            "DORA_SCOPE": "user",
-            "DORA_SETTINGS": "{}",
-            **own,
-        }
-    )
+    flow = tmp_path / "gone.yml"
+    write_start(monkeypatch, tmp_path, flow)
     with pytest.raises(DoraSystemdError, match=f"{flow}"):
         bench.act("start", NOBODY)
     with pytest.raises(DoraSystemdError, match="cannot enable arm: it has ended") as caught:
