@@ -119,10 +119,12 @@ def act(scope: Scope, message: PageMessage, manager: Manager | None = None) -> s
         return _roll_back(bus, scope, known.name, message.release)
     if isinstance(known, Cell):
         return _ACTIONS[message.action](bus, scope, known, message)
-    if message.action in ("start", "restart"):
+    if message.action in ("start", "restart") and not message.node:
         return told(restart_asked(bus, scope, known, os.environ, None, _BY))
-    hint = f"doractl start {known.name}"
-    raise DoraSystemdError(f"cannot {message.action} {known.name}: it has ended", hint)
+    what = f"{known.name}: it has ended"
+    if message.node:
+        what = f"node {message.node}: {known.name} has ended"
+    raise DoraSystemdError(f"cannot {message.action} {what}", f"doractl start {known.name}")
 
 
 def _act(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:

@@ -181,6 +181,8 @@ def test_the_page_starts_what_has_ended(
     with pytest.raises(DoraSystemdError, match="cannot enable arm: it has ended") as caught:
         bench.act("enable", NOBODY)
     assert caught.value.hint == "doractl start arm"
+    with pytest.raises(DoraSystemdError, match="cannot restart node a: arm has ended"):
+        bench.act("restart", NOBODY, node="a")
 
 
 @pytest.mark.parametrize(
