@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 from signal import SIGKILL, Signals, pidfd_send_signal
 
+from dora_systemd.decisions.cell.extra import EXTRA
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import UNIT_SUFFIX, is_node_id
@@ -91,7 +92,7 @@ def node_groups(path: Path) -> dict[str, Path]:
 
 
 def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
-    """The existing groups of `nodes`, or up to MAX_GROUPS groups that may be nodes'.
+    """The existing groups of `nodes`, or up to MAX_GROUPS groups that may be nodes', but for EXTRA.
 
     For readers outside the cell: the nodes' user can create groups of any name and number.
     """
@@ -120,7 +121,8 @@ def _by_node(path: Path, names: Iterable[str]) -> dict[str, Path]:
 
 
 def _is_node_group(name: str) -> bool:
-    return name.startswith(NODE_PREFIX) and is_node_id(name.removeprefix(NODE_PREFIX))
+    node = name.removeprefix(NODE_PREFIX)
+    return node != name and is_node_id(node) and node not in EXTRA
 
 
 def read_usage(path: Path) -> Usage:

@@ -11,6 +11,7 @@ import pytest
 from dora_systemd import __version__
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.extra import RECORDER
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.resources.usage import CpuSample
 from dora_systemd.decisions.views.dataflows import format_dataflows
@@ -204,6 +205,16 @@ def test_node_table_that_cannot_be_read(scope: Scope) -> None:
     assert (row.status, row.nodes_alive, row.nodes_total) == ("Running", 1, 1)
     assert row.cpu_percent == pytest.approx(10, rel=0.2)
     assert row.nodes[0].state == "unknown"
+
+
+def test_the_recorder_is_no_node_for_other_users(scope: Scope, unit_group: Path) -> None:
+    recorder = unit_group / f"node-{RECORDER}"
+    recorder.mkdir()
+    (recorder / "cgroup.events").write_text("populated 1\n")
+    manager = FakeManager()
+    manager.add(options(), ControlGroup=GROUP)
+    row = row_of(manager, scope)
+    assert ([one.node for one in row.nodes], row.nodes_alive) == (["camera"], 1)
 
 
 DAMAGE: dict[str, Callable[[Path], object]] = {
