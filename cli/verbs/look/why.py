@@ -24,7 +24,7 @@ def command(selector: str | None, file: str | None, output: str) -> int:
 
     The dataflow may be running, failed, stopped, or known only to the journal. Nothing is changed.
 
-    Without a SELECTOR: the dataflow that failed last.
+    Without a SELECTOR: a degraded dataflow that runs, or else the one that failed last.
 
     Examples:
       doractl why                   the newest failure
