@@ -101,7 +101,7 @@ async def changed_files(
         await _wait_root(rules.root)
         is_unsure = True
         async for paths, is_new in _with_start(rules, idle_ms):
-            files = seen.take(path for path in paths if rules.has(path))
+            files = seen.take(path for path in paths if _is_file(rules, path))
             # Found by their identity: changes before the new watches, and those that watchfiles
             # drops because they arrive between its copy of others and the clearing of its list.
             if is_new or (is_unsure and not paths):
@@ -168,6 +168,12 @@ class Seen:
             else:
                 self._seen[path] = one
                 self._gone.discard(path)
+
+
+def _is_file(rules: WatchRules, path: str) -> bool:
+    """Whether a change of `path` counts: a pattern can match a directory, too."""
+    is_directory = Path(path).is_dir() and not Path(path).is_symlink()
+    return rules.has(path) and (path in rules.files or not is_directory)
 
 
 def watched_files(rules: WatchRules) -> dict[str, Identity]:

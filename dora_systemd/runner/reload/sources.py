@@ -224,6 +224,8 @@ def check_programs(paths: Iterable[str]) -> None:
         try:
             with Path(path).open(errors="replace") as file:
                 text = file.read() if is_python else ""  # a binary may have a gigabyte
+        except IsADirectoryError:
+            continue  # a link that a pattern matches, to a directory
         except OSError as error:
             raise bad_input(f"cannot use {path}: {error.strerror}") from error
         if is_python and (reason := syntax_error(path, text)):

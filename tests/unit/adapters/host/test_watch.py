@@ -92,6 +92,22 @@ def test_what_is_unchanged_is_not_told(tmp_path: Path) -> None:
         asyncio.run(first(WatchRules(str(tmp_path), ("*.py",)), 100, seconds=1.0))
 
 
+def test_a_directory_that_a_pattern_matches_is_no_file(tmp_path: Path) -> None:
+    """It cannot be read, so each reload would be refused from then on."""
+    made = tmp_path / "conf/made"
+    made.parent.mkdir()
+
+    async def save() -> None:
+        await asyncio.sleep(1)
+        made.mkdir()
+        (tmp_path / "conf/saved").write_text("")
+
+    async def both() -> frozenset[str]:
+        return (await asyncio.gather(first(WatchRules(str(tmp_path), ("conf/*",))), save()))[0]
+
+    assert asyncio.run(both()) == {str(tmp_path / "conf/saved")}
+
+
 def test_a_change_that_watchfiles_drops_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

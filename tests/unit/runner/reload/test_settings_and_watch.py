@@ -227,7 +227,8 @@ def test_a_program_that_is_no_python_is_not_read(tmp_path: Path) -> None:
     program, gone = tmp_path / "node", str(tmp_path / "gone")
     with program.open("wb") as file:
         file.truncate(1 << 40)
-    check_programs([str(program)])
+    (tmp_path / "link").symlink_to(tmp_path)
+    check_programs([str(program), str(tmp_path / "link")])
     with pytest.raises(DoraSystemdError, match=f"^cannot use {gone}: No such file"):
         check_programs([gone])
 
