@@ -72,7 +72,9 @@ def watch_rules(options: RunnerOptions) -> WatchRules:
     root = options.working_directory
     own = frozenset({options.dataflow, settings_path(options.dataflow)})
     watched = options.of_dataflow("watch") or DEFAULT_WATCH
-    return WatchRules(root, watched, options.of_dataflow("ignore"), read_gitignores(root), own)
+    of_nodes = tuple(options.by_node("watch").values())
+    ignored, gitignores = options.of_dataflow("ignore"), read_gitignores(root)
+    return WatchRules(root, watched, ignored, gitignores, own, of_nodes)
 
 
 async def changed_files(

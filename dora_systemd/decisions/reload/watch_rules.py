@@ -47,10 +47,12 @@ class WatchRules(NamedTuple):
     # by directory relative to root, lines of .gitignore
     gitignores: Mapping[str, tuple[str, ...]] = {}
     files: frozenset[str] = frozenset()  # absolute paths that are always watched
+    of_nodes: tuple[tuple[str, ...], ...] = ()  # patterns of further files, of single nodes
 
     def has(self, path: str) -> bool:
         """Whether a change of the file `path` (absolute) causes a reload."""
-        is_watched = _spec(self.watched).match_file(self._relative(path))
+        relative = self._relative(path)
+        is_watched = any(_spec(one).match_file(relative) for one in (self.watched, *self.of_nodes))
         return path in self.files or (is_watched and not self.is_ignored(path))
 
     def has_directory(self, path: str) -> bool:

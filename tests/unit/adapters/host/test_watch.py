@@ -14,6 +14,7 @@ from dora_systemd.adapters.host import watch
 from dora_systemd.decisions.reload.watch_rules import WatchRules
 from dora_systemd.errors import DoraSystemdError
 from tests.lab.pace import bound
+from tests.unit.fakes.manager import options, with_texts
 
 SECONDS = 20.0
 
@@ -106,6 +107,16 @@ def test_a_directory_that_a_pattern_matches_is_no_file(tmp_path: Path) -> None:
         return (await asyncio.gather(first(WatchRules(str(tmp_path), ("conf/*",))), save()))[0]
 
     assert asyncio.run(both()) == {str(tmp_path / "conf/saved")}
+
+
+@pytest.mark.parametrize("of_all", [(), ("watch=*.txt",)])
+def test_further_files_of_nodes_are_watched(tmp_path: Path, of_all: tuple[str, ...]) -> None:
+    given = options(working_directory=str(tmp_path))
+    texts = ("camera:watch=extra/**", "camera:watch=!extra/not", "arm:watch=*.map", "ignore=old.*")
+    rules = watch.watch_rules(with_texts(given, *texts, *of_all))
+    every = ["a.py", "a.txt", "extra/in/a.bin", "extra/not", "a.map", "old.map", "a.bin", "a.csv"]
+    found = [name for name in every if rules.has(f"{tmp_path}/{name}")]
+    assert found == ["a.txt" if of_all else "a.py", "extra/in/a.bin", "a.map"]
 
 
 def test_a_change_that_watchfiles_drops_is_found(
