@@ -111,6 +111,10 @@ def test_a_file_that_has_gone(cell: Cell, project: Project, token: Path) -> None
     cell.start(flow_of(project), "--credential", f"token={token}")
     token.unlink()
     done = cell.doractl("restart", cell.name, check=False)
+    assert done.returncode == ExitCode.BAD_INPUT
+    assert f"cannot use {token} as credential token: there is no such file" in done.stderr
+    assert cell.show("ActiveState") == "active"
+    done = cell.doractl("restart", cell.name, "--force", check=False)
     assert done.returncode == ExitCode.FAILURE
     assert "a credential could not be read (exit code 243/CREDENTIALS)" in done.stderr
 
