@@ -4,9 +4,10 @@ import os
 import re
 import stat
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_waited
@@ -41,7 +42,7 @@ from dora_systemd.verbs.facts.reading import Reading
 _SAMPLE_SECONDS = 0.3
 _MOST_BUSY = 10
 """Processes whose threads are read."""
-_NODE = r"/dora-([^/]+)\.service/node-([^/]+)"
+_NODE = r"dora-([^/]+)\.service/node-([^/]+)"
 
 Delays = Mapping[str, int]
 Sleep = Callable[[float], None]
@@ -91,6 +92,8 @@ class _Sample:
         sleep: Sleep,
     ) -> None:
         self._waited, self._proc = waited, proc
+        group = f"/{next(iter(groups.values())).relative_to(cgroup.mount_point())}"
+        self._place = _unit_place(group).above
         self._pids = {node: frozenset(cgroup.pids(path)) for node, path in groups.items()}
         delays, before, began = self._delays(), read_times(proc), time.monotonic()
         sleep(_SAMPLE_SECONDS)
@@ -117,14 +120,35 @@ class _Sample:
         others = [one for one in self._busy if one.pid not in self._pids[node]]
         rivals = on_cpus(others, self._threads, cpu_numbers(bits))
         shared = _shared(self._interrupts, options, node, bits)
-        named = tuple(_with_node(one, self._proc) for one in rivals)
+        named = tuple(_with_node(one, self._place, self._proc) for one in rivals)
         return CpuWait(node, waited, span, cpus=cpus, rivals=named, shared=shared)
 
 
-def _with_node(rival: Rival, proc: Path) -> Rival:
-    """The rival with the node that it belongs to."""
-    match = re.search(_NODE, process_group(rival.pid, proc))
+def _with_node(rival: Rival, above: Sequence[str], proc: Path) -> Rival:
+    """The rival with the node that it belongs to. above: the manager of its dataflow."""
+    place = _unit_place(process_group(rival.pid, proc))
+    match = re.match(_NODE, f"{place.unit}/{place.below}") if place.above == above else None
     return rival._replace(node=f"{match[2]} of {match[1]}") if match else rival
+
+
+class _UnitPlace(NamedTuple):
+    """The unit of a process, by its cgroup. Users choose the names of the groups below it."""
+
+    above: Sequence[str]  # the unit of the user's manager that it belongs to
+    unit: str
+    below: str
+
+
+def _unit_place(group: str) -> _UnitPlace:
+    """Find the unit in the path of a cgroup, see systemd.slice(5)."""
+    above = list[str]()
+    parts = group.split("/")
+    for number, part in enumerate(parts, 1):
+        if part.endswith((".service", ".scope")):
+            if not part.startswith("user@"):
+                return _UnitPlace(above, part, "/".join(parts[number:]))
+            above.append(part)
+    return _UnitPlace(above, "", "")
 
 
 def shared_interrupts(interrupts: Interrupts, options: RunnerOptions) -> Iterator[Shared]:

@@ -89,6 +89,25 @@ def test_a_busy_process_is_named(scope: Scope, write: Write, proc: Path) -> None
     assert 20 < rival.cpu_percent <= 110
 
 
+@pytest.mark.parametrize(
+    "group",
+    [
+        "/dora.slice/dora-a.service/dora-b.service/node-n",
+        "/user.slice/user-1000.slice/session-1.scope/dora-b.service/node-n",
+        "/user.slice/user-1000.slice/user@1000.service/app.slice/dora-b.service/node-n",
+    ],
+)
+def test_a_group_that_only_has_the_name_of_a_node(
+    scope: Scope, write: Write, proc: Path, group: str
+) -> None:
+    """The user of a dataflow chooses names in it, and can have one of that name."""
+    write("cpu.pressure", PSI.format("31.25"))
+    write("cgroup.procs", "11\n")
+    (proc / "12/cgroup").write_text(f"0::{group}\n")
+    (one,) = waits(scope, proc)
+    assert [(rival.pid, rival.node) for rival in one.rivals] == [(12, "")]
+
+
 def test_a_process_on_another_cpu_is_no_rival(scope: Scope, write: Write, proc: Path) -> None:
     write("cpu.pressure", PSI.format("31.25"))
     (there,), (elsewhere,) = waits(scope, proc, "1"), waits(scope, proc, "8000")
