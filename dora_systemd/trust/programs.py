@@ -1,7 +1,7 @@
 """Starts programs that another user may have written; no other module starts processes for others.
 
 - A program runs as the account that owns it, with that account's environment, so that no variable
-  of root's gets there.
+  of root's gets there, and without the caller's keys.
 - As root, and without an account, only those programs run that root alone can change, including all
   directories above them and their interpreters.
 """
@@ -11,8 +11,10 @@ import os
 import pwd
 import select
 import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from threading import Thread
 from typing import NamedTuple, TypeVar
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -23,6 +25,11 @@ _User = TypeVar("_User", int, str)
 DEFAULT_PATH = "/usr/local/bin:/usr/bin:/bin"
 _LANGUAGE = "C.UTF-8"
 _END_SECONDS = 2.0
+_JOIN_SESSION_KEYRING = 1
+_KEYCTL = {"x86_64": 250, "ppc64le": 271, "s390x": 280}
+_KEYCTL_OF_32_BITS = {"x86_64": 288, "i686": 288, "aarch64": 311, "armv7l": 311, "armv6l": 311}
+_KEYCTL_ELSEWHERE = 219
+"""The number of keyctl(2), for which the C library has no function."""
 _FIRST_LINE = 256
 """Bytes of the line "#!INTERPRETER" that the kernel reads, see execve(2)."""
 
@@ -111,18 +118,57 @@ def spawn(
     elif environment is None:
         environment = fresh_environment(account)
     other = account if account is not None and account.uid != os.geteuid() else None
-    return subprocess.Popen(
-        command,
-        stdin=stdin,
-        stdout=subprocess.PIPE,
-        stderr=stderr,
-        env=environment,
-        cwd=directory,
-        start_new_session=True,
-        user=None if other is None else other.uid,
-        group=None if other is None else other.gid,
-        extra_groups=None if other is None else other.groups,
-    )
+
+    def start() -> "subprocess.Popen[bytes]":
+        return subprocess.Popen(
+            command,
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            env=environment,
+            cwd=directory,
+            start_new_session=True,
+            user=None if other is None else other.uid,
+            group=None if other is None else other.gid,
+            extra_groups=None if other is None else other.groups,
+        )
+
+    return start() if other is None else _without_keys(start)
+
+
+def _without_keys(start: "Callable[[], subprocess.Popen[bytes]]") -> "subprocess.Popen[bytes]":
+    """Call `start` in a thread that has left the keys of the caller. Raises what that raises."""
+    found: list[subprocess.Popen[bytes]] = []
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        leave_keys()
+        try:
+            found.append(start())
+        except BaseException as error:  # whatever it is, the caller gets it
+            errors.append(error)
+
+    thread = Thread(target=run)
+    thread.start()
+    thread.join()
+    if errors:
+        raise errors[0]
+    return found[0]
+
+
+def leave_keys() -> None:
+    """Give this thread, and what it starts, an empty session keyring, see session-keyring(7).
+
+    A program possesses the keys of the one that starts it, whatever user it becomes: root's, or by
+    sudo(8) those of the caller, such as tickets of Kerberos. A container may refuse this, with all
+    other calls for keys.
+    """
+    # Imported late: few verbs start programs of others.
+    import ctypes
+
+    machine, is_wide = os.uname().machine, sys.maxsize > 2**32
+    number = (_KEYCTL if is_wide else _KEYCTL_OF_32_BITS).get(machine, _KEYCTL_ELSEWHERE)
+    ctypes.CDLL(None).syscall(ctypes.c_long(number), ctypes.c_long(_JOIN_SESSION_KEYRING), None)
 
 
 def end_child(child: "subprocess.Popen[bytes]") -> None:
@@ -148,6 +194,7 @@ def end_child(child: "subprocess.Popen[bytes]") -> None:
 def become(account: Account) -> None:
     """Change this process to the account; there is no way back. Raises OSError."""
     if account.uid != os.geteuid():
+        leave_keys()
         os.setgroups(account.groups)
         os.setgid(account.gid)
         os.setuid(account.uid)

@@ -162,6 +162,9 @@ LATE = {
     "in the child that reads a project, whose interpreter does not look for it": {
         "trust.courier": {"pathspec"},
     },
+    "few verbs start programs of another user": {
+        "trust.programs": {"ctypes"},
+    },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},

@@ -38,6 +38,28 @@ print(flush=True)
 time.sleep(100)
 """
 
+FIND_KEY = """
+import ctypes, sys
+search = ctypes.CDLL(None).syscall
+print(search(int(sys.argv[1]), 10, -3, b"user", b"of-the-caller", 0) > 0)  # KEYCTL_SEARCH
+"""
+KEEP_KEY = """
+import ctypes, os, sys
+from dora_systemd.trust import programs, terminals
+libc = ctypes.CDLL(None)
+number, add = (250, 248) if os.uname().machine == "x86_64" else (219, 217)
+libc.syscall(number, 1, None)
+if libc.syscall(add, b"user", b"of-the-caller", b"x", 1, ctypes.c_long(-3)) < 0:
+    sys.exit(77)
+command = ["/usr/bin/env", "python3", "-c", sys.argv[2], str(number)]
+account = programs.Account(65534, 65534, (), "nobody")
+if sys.argv[1] == "caller":
+    account = programs.own_account()
+if sys.argv[1] == "terminal":
+    sys.exit(terminals.run_apart(command, {"PATH": programs.DEFAULT_PATH}, account))
+sys.stdout.write(programs.spawn(command, account, directory="/").communicate()[0].decode())
+"""
+
 root_only = pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
 NOBODY, GONE = 65534, 3_999_999_999
 
@@ -171,3 +193,16 @@ def test_a_child_ends_although_another_process_has_its_streams() -> None:
         end_child(child)
     assert child.returncode == -signal.SIGKILL
     assert [one.closed for one in (child.stdin, child.stdout, child.stderr) if one] == [True] * 3
+
+
+@root_only
+@pytest.mark.parametrize(
+    ("who", "expected"), [("caller", "True"), ("other", "False"), ("terminal", "False")]
+)
+def test_nobody_else_gets_the_keys_of_the_caller(who: str, expected: str) -> None:
+    """A key of the session is possessed by all programs in it, whatever user they become."""
+    command = [sys.executable, "-c", KEEP_KEY, who, FIND_KEY]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    if done.returncode == 77:
+        pytest.skip("no keys here")
+    assert done.stdout.strip() == expected, done.stderr
