@@ -19,6 +19,7 @@ from dora_systemd.adapters.journal.journalctl import (
     open_journalctl,
 )
 from dora_systemd.decisions.cell.exits import KILLED
+from dora_systemd.decisions.logs.journal_events import NODE_END_EVENTS
 from dora_systemd.decisions.logs.query import (
     failure_matches,
     journal_timestamp,
@@ -48,6 +49,7 @@ _LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
 MAX_LINE = 1024 * 1024
 """Maximum bytes of a record, or of a value."""
 _MOST_FORGED = 100
+_MOST_DOUBTED = 20
 _MOST_NAMES = 1000
 _MOST_DETAIL = 300
 _MOST_RECORDS = 1000
@@ -104,24 +106,35 @@ class JournalReader:
         """The UUIDs in all records, sorted: anybody can write more, see name_of()."""
         return list(filter(is_uuid, self.unique("DORA_DATAFLOW")))
 
-    def known_nodes(self, scope: Scope, name: str) -> list[str]:
-        """The nodes of the dataflows of `scope` called `name` with a record, sorted."""
+    def known_nodes(self, scope: Scope, name: str, wanted: Sequence[str] = ()) -> list[str]:
+        """The nodes of the dataflows of `scope` called `name` with a record, sorted.
+
+        wanted: names that are looked for first, because other users can write many names.
+        """
         own = scope_matches(scope, name)
-        events = self.newest([*own, "DORA_EVENT=node-ready"], _MOST_NAMES)
-        known = {node for one in events if is_node_id(node := str(one.get("DORA_NODE", "")))}
+        known = set[str]()
+        for events in (("node-ready",), NODE_END_EVENTS):
+            matches = [*own, *(f"DORA_EVENT={one}" for one in events)]
+            records = self.newest(matches, _MOST_NAMES, fields=("DORA_NODE",))
+            known |= {node for one in records if is_node_id(node := str(one.get("DORA_NODE", "")))}
         parts = (one.partition("/") for one in self.unique("SYSLOG_IDENTIFIER"))
-        found = (node for dataflow, _, node in parts if dataflow == name and is_node_id(node))
-        return self._recorded(known, found, lambda node: [*own, f"DORA_NODE={node}"])
+        others = (node for dataflow, _, node in parts if dataflow == name)
+        found = dict.fromkeys(filter(is_node_id, (*wanted, *others)))
+        return self._recorded(known, found, lambda node: [*own, f"DORA_NODE={node}"], _MOST_DOUBTED)
 
     def _recorded(
-        self, known: set[str], found: Iterable[str], matches: Callable[[str], list[str]]
+        self,
+        known: set[str],
+        found: Iterable[str],
+        matches: Callable[[str], list[str]],
+        most: int = _MOST_FORGED,
     ) -> list[str]:
         """Return `known`, and those of `found` that really have a record, sorted.
 
         Any user can write records that look like those of another dataflow. matches: the fields of
-        a real record.
+        a real record. most: of those that are looked up, one by one.
         """
-        doubtful = islice((one for one in found if one not in known), _MOST_FORGED)
+        doubtful = islice((one for one in found if one not in known), most)
         return sorted(known.union(one for one in doubtful if any(self.newest(matches(one), 1))))
 
     def count_own(self, since_us: int, until_us: int) -> int:

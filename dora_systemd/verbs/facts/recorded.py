@@ -115,7 +115,7 @@ def _with_nodes(
     if not queries[0].name:
         hint = "say which dataflow: doractl logs NAME --node NODE"
         raise usage_error("cannot select nodes of all dataflows", hint)
-    known = [journal.known_nodes(one.scope, one.name) for one in queries]
+    known = [journal.known_nodes(one.scope, one.name, patterns) for one in queries]
     if not patterns:
         every = zip(queries, known, strict=True)
         return [replace(one, nodes=("", *nodes)) for one, nodes in every]

@@ -3,7 +3,7 @@
 import os
 import select
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -38,8 +38,8 @@ class FakeJournal(JournalReader):
     def known_uuids(self) -> list[str]:
         return [ROBOT, FORGED, ARM]
 
-    def known_nodes(self, scope: Scope, name: str) -> list[str]:
-        del scope
+    def known_nodes(self, scope: Scope, name: str, wanted: Sequence[str] = ()) -> list[str]:
+        del scope, wanted
         return ["cam-left", "cam-right", "sink"] if name == "robot" else []
 
     def name_of(self, scope: Scope, uuid: str) -> str:

@@ -140,7 +140,21 @@ def test_no_flood_of_forged_names_takes_long(journalctl: Path) -> None:
     many = [f"robot/x{number}" for number in range(2000)]
     play_fields(journalctl, {"SYSLOG_IDENTIFIER": many}, {"DORA_EVENT=node-ready": READY})
     assert JournalReader().known_nodes(SYSTEM, "robot") == ["a"]
-    assert len(Path(f"{journalctl}.asked").read_text().splitlines()) == 102
+    assert len(Path(f"{journalctl}.asked").read_text().splitlines()) == 23
+
+
+def test_forged_names_hide_no_node(journalctl: Path) -> None:
+    """Neither one that has failed before it was ready, nor one that is looked for."""
+    own = "-- _SYSTEMD_UNIT=dora-robot.service"
+    many = [*(f"robot/x{number}" for number in range(2000)), "robot/y", "robot/z"]
+    records = {
+        f"{own} DORA_EVENT=node-exited DORA_EVENT=node-crashed DORA_EVENT=node-ended "
+        "DORA_EVENT=node-oom": json.dumps({"DORA_NODE": "z"}),
+        f"{own} DORA_NODE=y": ANY,
+    }
+    play_fields(journalctl, {"SYSLOG_IDENTIFIER": many}, records)
+    assert JournalReader().known_nodes(SYSTEM, "robot") == ["z"]
+    assert JournalReader().known_nodes(SYSTEM, "robot", ["y", "*", "not-there"]) == ["y", "z"]
 
 
 def test_killed_nodes(journalctl: Path) -> None:
