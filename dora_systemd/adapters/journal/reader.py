@@ -45,6 +45,7 @@ _PLACES = {_VOLATILE: Place.MEMORY, _PERSISTENT: Place.DISK}
 _LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
 _NAME_FIELDS = ("DORA_DATAFLOW", "DORA_DATAFLOW_NAME", "_SYSTEMD_UNIT", "_SYSTEMD_USER_UNIT")
 _LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
+_EVENT_FIELDS = (*_NAME_FIELDS, *_LIFE_FIELDS[1:])
 
 MAX_LINE = 1024 * 1024
 """Maximum bytes of a record, or of a value."""
@@ -186,7 +187,9 @@ class JournalReader:
         """
         matches = [f"DORA_EVENT=dataflow-{event}" for event in _LIFE_EVENTS]
         found: dict[tuple[str, str], LastEvent] = {}
-        for record in self.newest([*scope_matches(scope, name), *matches], None):
+        matches = [*scope_matches(scope, name), *matches]
+        # Not all fields: a node can write records that fill the bounds of a reading.
+        for record in self.newest(matches, None, fields=_EVENT_FIELDS):
             if event := _last_event(record):
                 found.setdefault((event.name, "" if is_by_name else event.uuid), event)
             if len(found) >= limit:

@@ -33,6 +33,15 @@ def ended_rows(scope: Scope, rows: Sequence[DataflowRow] = ()) -> list[DataflowR
     return [ended_row(event) for event in _last_events(scope) if event.uuid not in known]
 
 
+def ended_of_name(scope: Scope, name: str) -> DataflowRow | None:
+    """The newest ended dataflow of that name, or None.
+
+    By the records of its unit alone, among which no other dataflow can write.
+    """
+    event = next(iter(_last_events(scope, limit=1, name=name)), None)
+    return ended_row(event) if event else None
+
+
 def not_recorded(error: DoraSystemdError) -> DoraSystemdError:
     """The error for a dataflow that is not in the journal either."""
     if not is_volatile() or error.code is not ExitCode.NOT_FOUND:

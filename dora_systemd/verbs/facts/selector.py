@@ -166,9 +166,11 @@ class Selector(NamedTuple):
     def ended(self, scope: Scope) -> "DataflowRow | None":
         """Find the newest matching dataflow with an end in the journal, or None."""
         # Imported late: the journal is slow, and dataflows that systemd knows do not need it.
-        from dora_systemd.verbs.facts.ended import ended_rows
+        from dora_systemd.verbs.facts.ended import ended_of_name, ended_rows
 
-        return next(iter(self.meant(ended_rows(scope))), None)
+        named = (ended_of_name(scope, one) for one in self.names if is_name(one))
+        found = next(filter(None, named), None)
+        return found or next(iter(self.meant(ended_rows(scope))), None)
 
     def find_name(self, manager: Manager, scope: Scope, kept: Sequence[str]) -> str:
         """Find the name of a dataflow in `kept`, or of one that systemd knows or that has ended.

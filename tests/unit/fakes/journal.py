@@ -1,6 +1,6 @@
 """A journal of a few records: the files that say who may read it, and a journalctl that finds them.
 
-It knows --lines=, --field= and matches, see journalctl(1).
+It knows --lines=, --field=, --output-fields= and matches, see journalctl(1).
 """
 
 import json
@@ -31,12 +31,20 @@ for one in words[words.index("--") + 1 :] if "--" in words else []:
 limits = [int(one[8:]) for one in words if one.startswith("--lines=")]
 fields = [one[8:] for one in words if one.startswith("--field=")]
 lines = open(records).readlines()
+wanted = [key for one in words if one.startswith("--output-fields=") for key in one[16:].split(",")]
+
+def shown(line):
+    if not wanted:
+        return line
+    kept = [(key, one) for key, one in json.loads(line).items() if key[:2] == "__" or key in wanted]
+    return json.dumps(dict(kept)) + "\\n"
+
 if fields:
     print(*{str(json.loads(line)[fields[0]]) for line in lines if fields[0] in line}, sep="\\n")
     sys.exit()
 found = [
     line
-    for line, record in ((line, json.loads(line)) for line in lines)
+    for line, record in ((shown(line), json.loads(line)) for line in lines)
     if any(all(record.get(key) in values for key, values in term.items()) for term in terms)
 ]
 sys.stdout.writelines(found[: limits[0]] if limits else found)

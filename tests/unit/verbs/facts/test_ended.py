@@ -94,6 +94,13 @@ def test_one_row_for_each_name_that_does_not_run(
     assert [row.name for row in ended(manager, 2)] == ["still", "gone"]
 
 
+def test_a_node_that_fills_the_journal_hides_no_other(journal: FakeJournal) -> None:
+    """It can write life events of its own dataflow, with any fields in addition."""
+    full = life_record("dataflow-started", 50, "full", MORE="x" * 900_000)
+    journal.write(*[full] * 50, life_record("dataflow-stopped", 30, "gone", OTHER))
+    assert [row.name for row in ended_rows(SCOPE)] == ["full", "gone"]
+
+
 @pytest.mark.parametrize(
     ("began", "result", "shown"),
     [

@@ -159,6 +159,15 @@ def test_the_newest_one_that_has_ended(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert Selector("nobody").ended(scope) is None
 
 
+def test_one_that_ended_before_many_others(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    scope = ScopeIn(is_user=False, uid=0, root=tmp_path)
+    names = [*(f"n{number}" for number in range(150)), "robot"]
+    records = [life_record("dataflow-stopped", 1, name, scope=scope) for name in names]
+    FakeJournal(monkeypatch, tmp_path).write(*records)
+    found = Selector("robot").ended(scope)
+    assert found == ended_row(LastEvent("robot", UUID, "dataflow-stopped", 1, ""))
+
+
 NEEDS_IT: dict[str, Callable[[str, FakeManager, Scope], object]] = {
     "set": lambda text, manager, scope: Selector(text).find_present(manager, scope),
     "enable": lambda text, manager, scope: find_all(manager, scope, ["other", text]),
