@@ -171,7 +171,7 @@ def _reaching(path: Path) -> Iterator[None]:
         hint = "use sudo: only root and the user it runs as may"
         raise _unreachable(path, "permission denied", hint, ExitCode.NO_PERMISSION) from error
     except (OSError, ValueError) as error:
-        hint = "it may be starting or stopping; see doractl list"
+        hint = "it may be starting, stopping or frozen; see doractl list"
         reason = (isinstance(error, OSError) and error.strerror) or str(error)
         raise _unreachable(path, reason, hint, ExitCode.NOT_RUNNING) from error
 

@@ -124,6 +124,7 @@ def test_an_order_for_a_runner_that_is_silent(tmp_path: Path) -> None:
         with pytest.raises(DoraSystemdError, match="timed out") as caught:
             order(path, {"verb": "reload"}, 0.05)
     assert caught.value.code == ExitCode.NOT_RUNNING
+    assert caught.value.hint == "it may be starting, stopping or frozen; see doractl list"
 
 
 def test_an_order_takes_as_long_as_its_caller_says(tmp_path: Path) -> None:
