@@ -20,6 +20,7 @@ from typing import BinaryIO, NamedTuple, Protocol
 from dora_systemd.decisions.bundles.manifest import Part
 from dora_systemd.decisions.views.rows import Bundles
 from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input, words_of
+from dora_systemd.scope import place_hint
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import SECOND, as_mapping, format_rounded_size, shown
 
@@ -268,7 +269,7 @@ class BundleStore:
                     one.mkdir(mode, parents=True, exist_ok=True)
                     one.chmod(mode)
         except OSError as error:
-            raise unusable(self.path, error) from error
+            raise unusable(self.path, error, ", or -o FILE") from error
 
     def remove(self, names: list[str]) -> None:
         """Remove bundles, or none of them. Raises DoraSystemdError (NOT_FOUND)."""
@@ -364,9 +365,9 @@ def require_replaceable(path: Path) -> None:
             raise bad_input(f"cannot write a bundle to {shown(str(path))}: {reason}", hint)
 
 
-def unusable(path: Path, error: OSError) -> DoraSystemdError:
-    """The error for a store that cannot be used."""
+def unusable(path: Path, error: OSError, otherwise: str = "") -> DoraSystemdError:
+    """The error for a store that cannot be used. otherwise: what else the hint names if refused."""
     is_refused = isinstance(error, PermissionError)
-    hint = "use sudo, or -o FILE" if is_refused else "see df"
+    hint = place_hint(path, error) + (otherwise if is_refused else "")
     code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
     return DoraSystemdError(f"cannot use {shown(str(path))}: {error.strerror}", hint, code)

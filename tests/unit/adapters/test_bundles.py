@@ -283,5 +283,11 @@ def test_what_cannot_be_used(tmp_path: Path) -> None:
     (tmp_path / "dora-systemd").touch()
     with pytest.raises(DoraSystemdError, match="cannot use"), locked(BundleStore(tmp_path, "a")):
         pass
-    refused = stores.unusable(tmp_path, PermissionError(errno.EACCES, "Permission denied"))
-    assert (refused.code, refused.hint) == (ExitCode.NO_PERMISSION, "use sudo, or -o FILE")
+    error = PermissionError(errno.EACCES, "Permission denied")
+    refused = stores.unusable(Path("/var/lib/dora-systemd/bundles"), error)
+    hint = "use sudo, or --user for a dataflow of your own"
+    assert (refused.code, refused.hint) == (ExitCode.NO_PERMISSION, hint)
+    assert stores.unusable(Path("/var/x"), error, ", or -o FILE").hint == f"{hint}, or -o FILE"
+    assert stores.unusable(Path("/root/.local/state"), error).hint.startswith("HOME is "), (
+        "sudo would search the bundles of the system, which are others"
+    )
