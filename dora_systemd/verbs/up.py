@@ -21,12 +21,13 @@ from dora_systemd.decisions.unit.setup_files import gateway_files
 from dora_systemd.decisions.views.diagnosis import Process
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
 from dora_systemd.trust.sockets import listener_uids, listening_sockets
 from dora_systemd.verbs.doctor import examine
 from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.enabled import enabled_names, own_directories
+from dora_systemd.verbs.facts.enabled import own_directories, wanted_units
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.setup import text_of
 
@@ -95,7 +96,10 @@ def start_boot_target(manager: Manager, scope: Scope) -> list[str]:
         return []
     running = {cell.name for cell in read_cells(manager) if cell.is_up}
     manager.run_jobs("StartUnit", [BOOT_TARGET])
-    return [name for name in enabled_names(manager, scope) if name not in running]
+    # What was enabled before dora.target was set up is linked below another target.
+    wanted = wanted_units(own_directories(manager, scope)[0], BOOT_TARGET)
+    names = filter(None, map(name_from_unit, wanted))
+    return sorted(name for name in names if name not in running)
 
 
 def written_files(manager: Manager, scope: Scope) -> list[Path]:

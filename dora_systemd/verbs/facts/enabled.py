@@ -19,9 +19,12 @@ def enabled_names(manager: Manager, scope: Scope) -> list[str]:
     return sorted(filter(None, map(name_from_unit, enabled_units(manager, scope))))
 
 
-def wanted_units(directory: Path) -> frozenset[str]:
-    """The units that targets in `directory` start: the links in its .wants directories."""
-    return frozenset(path.name for path in directory.glob("*.wants/dora-*.service"))
+def wanted_units(directory: Path, target: str = "*") -> frozenset[str]:
+    """The units that targets in `directory` start: the links in its .wants directories.
+
+    target: only this one.
+    """
+    return frozenset(path.name for path in directory.glob(f"{target}.wants/dora-*.service"))
 
 
 def lost_units(manager: Manager, scope: Scope) -> frozenset[str]:

@@ -152,4 +152,8 @@ def test_what_a_boot_starts(
     systemd.units[BOOT_TARGET] = {"LoadState": "loaded", "ActiveState": active}
     systemd.enable_unit_files(["dora-robot.service", "dora-runs.service"])
     systemd.add(options("runs"))
+    # Enabled before the target was set up: the target does not start it.
+    before = systemd.etc / "systemd" / scope.word / "multi-user.target.wants"
+    before.mkdir()
+    (before / "dora-before.service").symlink_to("/dev/null")
     assert start_boot_target(systemd, scope) == started
