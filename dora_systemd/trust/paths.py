@@ -138,6 +138,17 @@ def exists(path: str | Path) -> bool:
         return False
 
 
+def is_absent(path: str | Path) -> bool:
+    """Whether nothing exists at `path`; False if the caller may not look there."""
+    try:
+        with reached(path):
+            return False
+    except (DoraSystemdError, PermissionError):
+        return False
+    except (OSError, ValueError):
+        return True
+
+
 def is_link(path: Path) -> bool:
     """Whether the last component of `path` is a symbolic link, wherever that leads."""
     try:

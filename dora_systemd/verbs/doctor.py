@@ -51,7 +51,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of
 from dora_systemd.trust.files import read_file
-from dora_systemd.trust.paths import exists
+from dora_systemd.trust.paths import exists, is_absent
 from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sockets import TABLES, listening_sockets
 from dora_systemd.verbs.facts.cells import proven, read_cells
@@ -187,7 +187,7 @@ def _enabled(path: Path, scope: Scope) -> Iterator[Finding]:
         broken = "is gone" if text is None else "starts no dataflow"
         remedy = f"systemctl {scope.flag} disable {path.name}"
         yield Finding("boot", State.WARNING, f"{path} is enabled and {broken}", remedy)
-    elif not exists(options.dataflow):
+    elif is_absent(options.dataflow):
         text = f"{options.name} is enabled, but {options.dataflow} does not exist"
         yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
     elif runner_of(text, can_start=True) is None:

@@ -1,5 +1,6 @@
 """doctor against a fake systemd, and without any."""
 
+import errno
 import os
 import pwd
 from collections.abc import Iterator
@@ -290,6 +291,22 @@ def test_an_enabled_dataflow_whose_file_is_gone(manager: FakeManager, scope: Sco
     (finding,) = found(manager, scope).values()
     assert finding.text == "robot is enabled, but /srv/robot.yml does not exist"
     assert finding.remedy == "doractl disable robot"
+
+
+def test_an_enabled_dataflow_where_the_caller_may_not_look(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only root and their user reach the files of a release of the system."""
+    place(manager, make_plan(scope), want_boot=True)
+    real = os.open
+
+    def refuse(path: Any, *args: Any, **options: Any) -> int:
+        if path == "robot.yml":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return real(path, *args, **options)
+
+    monkeypatch.setattr(os, "open", refuse)
+    assert [one for one in look(manager, scope) if "does not exist" in one.text] == []
 
 
 @pytest.mark.parametrize(
