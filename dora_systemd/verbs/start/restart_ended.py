@@ -150,6 +150,8 @@ def _without_start(scope: Scope, selector: Selector) -> DoraSystemdError | None:
     """The error for a dataflow that has ended and has no recorded start, as after a first trial."""
     with suppress(DoraSystemdError):
         if row := selector.ended(scope):
+            if release := _committed(scope, row.name):
+                return _disabled(row.name, release)
             message = f"cannot start {row.name}: the journal does not have its start"
             hint = f"doractl start FILE --name {row.name}, or doractl deploy --name {row.name}"
             return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
@@ -173,17 +175,24 @@ def _readable(scope: Scope, selector: Selector) -> Asked | None:
 
 
 def _refuse_released(scope: Scope, asked: Asked) -> None:
+    if release := _committed(scope, asked.name):
+        raise _disabled(asked.name, release, f", or doractl start {asked.dataflow}")
+
+
+def _disabled(name: str, release: str, otherwise: str = "") -> DoraSystemdError:
+    message = f"cannot start {name}: its release {release} is disabled"
+    hint = f"doractl rollback {name} {release}{otherwise}"
+    return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+
+
+def _committed(scope: Scope, name: str) -> str:
+    """The release that has passed its trial since the last start of a project, or ""."""
     from dora_systemd.adapters.journal.reader import JournalReader
     from dora_systemd.decisions.logs.query import request_matches
 
-    name = f"DORA_DATAFLOW_NAME={asked.name}"
-    matches = [*request_matches(scope, EVENT, COMMITTED), name]
+    matches = [*request_matches(scope, EVENT, COMMITTED), f"DORA_DATAFLOW_NAME={name}"]
     newest = next(JournalReader().newest(matches, 1), {})
-    if newest.get("DORA_EVENT") == COMMITTED:
-        release = newest.get("DORA_RELEASE")
-        message = f"cannot start {asked.name}: its release {release} is disabled"
-        hint = f"doractl rollback {asked.name} {release}, or doractl start {asked.dataflow}"
-        raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+    return str(newest.get("DORA_RELEASE", "")) if newest.get("DORA_EVENT") == COMMITTED else ""
 
 
 def _asked(scope: Scope, matches: list[str]) -> Iterator[Asked]:

@@ -128,6 +128,15 @@ def test_an_end_without_a_start(journal: FakeJournal) -> None:
     assert caught.value.code is ExitCode.NOT_FOUND
 
 
+def test_a_release_that_was_never_started_from_its_project(journal: FakeJournal) -> None:
+    committed = record(DORA_EVENT="release-committed", DORA_RELEASE="20261121T220012")
+    journal.write(life_record("dataflow-stopped", 19, "robot"), committed)
+    with pytest.raises(DoraSystemdError, match="its release 20261121T220012 is disabled") as caught:
+        find_start(FakeManager(), SCOPE, Selector("robot"))
+    assert caught.value.hint == "doractl rollback robot 20261121T220012"
+    assert caught.value.code is ExitCode.NOT_FOUND
+
+
 def test_a_journal_that_cannot_be_read(journal: FakeJournal) -> None:
     journal.complain("No journal files were opened due to insufficient permissions.")
     with pytest.raises(DoraSystemdError, match="no dataflow named 'robot'"):
