@@ -7,7 +7,7 @@ from typing import Any
 
 from dora_systemd.decisions.life.causes import BY_SIGKILL
 from dora_systemd.decisions.logs.journal_events import STOP_ASKED
-from dora_systemd.decisions.logs.query import PROCESS_EXITED, UNIT_STARTING
+from dora_systemd.decisions.logs.query import PROCESS_EXITED, UNIT_STARTING, UNIT_STOPPING
 
 
 class Kills:
@@ -23,16 +23,21 @@ class Kills:
 
     def read(self, record: Mapping[str, Any]) -> None:
         """Read the next record."""
-        event, kind = record.get("DORA_EVENT"), record.get("MESSAGE_ID")
-        uuid = str(record.get("DORA_DATAFLOW", ""))
+        event, uuid = record.get("DORA_EVENT"), str(record.get("DORA_DATAFLOW", ""))
         if event == "dataflow-failed" and record.get("DORA_REASON") == BY_SIGKILL:
             self._failed[str(record.get("_SYSTEMD_INVOCATION_ID", ""))] = uuid
         elif event == STOP_ASKED:
             self.requested |= {life for life, own in self._running.items() if own == uuid != ""}
-        elif kind == PROCESS_EXITED and (life := life_of(record)) in self._failed:
+        elif not event:  # a node can write any field, but only into events
+            self._read_of_systemd(str(record.get("MESSAGE_ID", "")), life_of(record))
+
+    def _read_of_systemd(self, kind: str, life: str) -> None:
+        if kind == PROCESS_EXITED and life in self._failed:
             self._running[life] = self._failed.pop(life)
+        elif kind == UNIT_STOPPING and life in self._running:
+            self.requested.add(life)  # also by systemctl, or by a user whose records do not count
         elif kind == UNIT_STARTING:
-            self._running.pop(life_of(record), None)
+            self._running.pop(life, None)
 
 
 def life_of(record: Mapping[str, Any]) -> str:

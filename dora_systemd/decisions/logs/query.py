@@ -36,6 +36,9 @@ LEVELS = {
 UNIT_STARTING = "7d4958e842da4a758f6c1cdc7b36dcc5"
 """MESSAGE_ID of systemd's record when it begins to start a unit."""
 
+UNIT_STOPPING = "de5b426a63be47a7b6ac3eaac82e2f6f"
+"""MESSAGE_ID of systemd's record when it begins to stop a unit, because of a job."""
+
 UNIT_FAILED = "d9b373ed55a64feb8242e02dbe79a49c"
 """MESSAGE_ID of systemd's record when a unit has failed."""
 
@@ -224,7 +227,7 @@ def notice_matches(scope: Scope, name: str) -> list[str]:
 
 def kill_matches(scope: Scope, name: str) -> list[str]:
     """Matches for ends of processes, for begins of lives, and for requests to stop."""
-    ids = [f"MESSAGE_ID={one}" for one in (UNIT_STARTING, PROCESS_EXITED)]
+    ids = [f"MESSAGE_ID={one}" for one in (UNIT_STARTING, UNIT_STOPPING, PROCESS_EXITED)]
     asked = [*_asked_matches(scope, STOP_ASKED), f"DORA_DATAFLOW_NAME={name}"]
     return [*_systemd_matches(scope, name), *ids, "+", *asked]
 

@@ -16,6 +16,7 @@ from dora_systemd.decisions.logs.query import (
     UNIT_FAILED,
     UNIT_RESTART,
     UNIT_STARTING,
+    UNIT_STOPPING,
 )
 from dora_systemd.decisions.views.facts import NodeRow
 
@@ -23,7 +24,7 @@ from dora_systemd.decisions.views.facts import NodeRow
 UNIT_MESSAGES = {
     UNIT_STARTING: "unit-starting",
     "39f53479d3a045ac8e11786248231fbf": "unit-started",
-    "de5b426a63be47a7b6ac3eaac82e2f6f": "unit-stopping",
+    UNIT_STOPPING: "unit-stopping",
     "9d1aaa27d60140bd96365438aad20286": "unit-stopped",
     "7ad2d189f7e94e70a38c781354912448": "unit-succeeded",
     UNIT_FAILED: "unit-failed",

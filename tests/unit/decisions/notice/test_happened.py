@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from dora_systemd.decisions.cell.environment import checked_variable
 from dora_systemd.decisions.cell.environment_file import parse_environment_file
 from dora_systemd.decisions.life.causes import BY_SIGKILL
-from dora_systemd.decisions.logs.query import PROCESS_EXITED, UNIT_FAILED, UNIT_STARTING
+from dora_systemd.decisions.logs.query import (
+    PROCESS_EXITED,
+    UNIT_FAILED,
+    UNIT_STARTING,
+    UNIT_STOPPING,
+)
 from dora_systemd.decisions.notice.happened import (
     FIRST_PAUSE,
     LAST_PAUSE,
@@ -122,6 +127,10 @@ def stop_asked(seconds: float, uuid: str = UUID) -> dict[str, Any]:
     return record(seconds, DORA_EVENT="stop-asked", DORA_DATAFLOW=uuid)
 
 
+def unit_stopping(seconds: float, life: str) -> dict[str, Any]:
+    return record(seconds, MESSAGE_ID=UNIT_STOPPING, INVOCATION_ID=life)
+
+
 def unit_starting(seconds: float, life: str) -> dict[str, Any]:
     return record(seconds, MESSAGE_ID=UNIT_STARTING, INVOCATION_ID=life)
 
@@ -138,6 +147,9 @@ def unit_starting(seconds: float, life: str) -> dict[str, Any]:
         ([*killed(999, "2")[:2], stop_asked(998.5), *killed(999, "2")[2:]], 1),
         ([*killed(999, "2"), stop_asked(996), *killed(995, "1"), unit_starting(990, "1")], 1),
         ([stop_asked(999.5), *killed(999, "1")], 1),
+        ([*killed(999, "2"), unit_stopping(996, "2")], 0),
+        ([*killed(999, "2")[:2], unit_stopping(998.5, "2"), *killed(999, "2")[2:]], 1),
+        ([*killed(999, "2"), unit_stopping(996, "1")], 1),
     ],
 )
 def test_a_kill_that_was_requested_is_no_failure(records: list[dict[str, Any]], lives: int) -> None:

@@ -255,7 +255,8 @@ def test_what_its_end_means(
 def of_systemd(message: str, at: float) -> dict[str, object]:
     """A record of systemd about the life of the trial."""
     own = {"UNIT": "dora-robot.service", "_PID": "1", "INVOCATION_ID": "1"}
-    return {**record("", MESSAGE_ID=message, **own), "__MONOTONIC_TIMESTAMP": str(int(at * SECOND))}
+    known = {**crash(at), "DORA_NODE": "", "MESSAGE_ID": message, **own}
+    return {key: value for key, value in known.items() if key != "DORA_EVENT"}
 
 
 @pytest.mark.parametrize("asked_at", [1001.5, 1002.5, 0])
