@@ -237,10 +237,14 @@ def given_variables(settings: Settings, sight: Sight) -> dict[str, str]:
     variables: dict[str, str] = {}
     for file in settings[ENV_FILE]:
         is_lent = file in settings.lent
-        text = _read_lent(file, sight) if is_lent else decoded(read_file(file).data, Path(file))
+        text = _read_lent(file, sight) if is_lent else _read(Path(file).absolute())
         variables |= parse_environment_file(text, file)
     given = settings[ENV]
     return {**variables, **given}
+
+
+def _read(file: Path) -> str:
+    return decoded(read_file(file).data, file)
 
 
 def _read_lent(file: str, sight: Sight) -> str:

@@ -44,6 +44,13 @@ def test_a_uv_that_cannot_be_executed_is_none(tmp_path: Path) -> None:
     assert find_uv(str(tmp_path), Sight()) == ""
 
 
+def test_a_relative_file_of_variables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "more.env").write_text("LIMIT=3\n")
+    settings = resolve_settings({"env_file": ("more.env",)}, {}, [])
+    assert given_variables(settings, Sight()) == {"LIMIT": "3"}
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root reads what others may not")
 def test_a_link_of_another_user_to_variables_of_root(tmp_path: Path) -> None:
     """Every user sees the variables of a unit."""
