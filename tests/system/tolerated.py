@@ -86,6 +86,10 @@ TOLERATED = (
     ),
     Word("Timer event for unknown dataflow", "the daemon starts timers before it notes the run"),
     Word(
+        "control request failed: unknown dataflow",
+        "all nodes had ended before the request to stop came to the coordinator",
+    ),
+    Word(
         "Unable to create POSIX shm segment",
         "the lab's root may not raise limits, and nodes lock 8 MiB of shared memory or more",
     ),
