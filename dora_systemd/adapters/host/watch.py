@@ -174,8 +174,9 @@ class Seen:
 
 def _is_file(rules: WatchRules, path: str) -> bool:
     """Whether a change of `path` counts: a pattern can match a directory, too."""
-    is_directory = Path(path).is_dir() and not Path(path).is_symlink()
-    return rules.has(path) and (path in rules.files or not is_directory)
+    if not rules.has(path):
+        return False
+    return path in rules.files or Path(path).is_symlink() or not Path(path).is_dir()
 
 
 def watched_files(rules: WatchRules) -> dict[str, Identity]:
