@@ -114,14 +114,12 @@ def give_way(is_idle: bool) -> None:
     SCHED_IDLE, else by SCHED_BATCH and NICE. Without a weight, busy nodes leave nothing to an idle
     process, and neither policy takes the CPU from a node at a wake-up.
     """
-    done: set[str] = set()
+    policy, done = os.SCHED_IDLE if is_idle else os.SCHED_BATCH, set[str]()
     while new := {*os.listdir("/proc/self/task")} - done:  # noqa: PTH208 - without pathlib
         for thread in map(int, new):
             with suppress(OSError):
-                if is_idle:
-                    os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
-                else:
-                    os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
+                os.sched_setscheduler(thread, policy, os.sched_param(0))
+                if not is_idle:
                     nice = max(os.getpriority(os.PRIO_PROCESS, thread), NICE)
                     os.setpriority(os.PRIO_PROCESS, thread, nice)
         done |= new
