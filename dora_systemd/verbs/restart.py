@@ -13,7 +13,7 @@ from dora_systemd.adapters.runner_socket.client import ask_refusal
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import exists
+from dora_systemd.trust.paths import is_absent
 from dora_systemd.values import shown
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.containers import find_outside, with_left
@@ -92,7 +92,7 @@ def _lost_credential(manager: Manager, cell: Cell) -> DoraSystemdError | None:
     """The error for a credential whose file is not there any more: systemd reads it at a start."""
     given = manager.read(cell.unit, ["LoadCredential"])["LoadCredential"] or ()
     for name, file in given:
-        if file.startswith("/") and not exists(file):
+        if file.startswith("/") and is_absent(file):
             message = f"cannot use {shown(file)} as credential {name}: there is no such file"
             return _kept(cell, bad_input(message, "put it back"))
     return None

@@ -175,9 +175,7 @@ def _crash(crash: Happening) -> Verdict:
 
 def _end(life: Life, facts: Facts, shutdowns: Sequence[int]) -> Verdict:
     if (failure := life.last("dataflow-failed")) is not None:
-        asked = life.last("stop-asked")  # later ones call a restart off
-        is_killed = failure.detail("reason") == BY_SIGKILL
-        if is_killed and asked and asked.at_us <= _killed_us(life, failure):
+        if failure.detail("reason") == BY_SIGKILL and _is_kill_requested(life, failure):
             by = stopped_by(life, shutdowns)  # with --now
             return _found(Cause.STOPPED, f"stopped by {by}; killed", failure, by=by)
         return _failure(life, failure)
@@ -252,10 +250,15 @@ def _cause_of(life: Life, end: Happening) -> Cause:
     return Cause.NODE_FAILED if final_crashes(life) else Cause.UNIT_FAILED
 
 
-def _killed_us(life: Life, failure: Happening) -> int:
-    """When the runner was killed. systemd records that before it runs what writes `failure`."""
+def _is_kill_requested(life: Life, failure: Happening) -> bool:
+    """Whether a stop was requested before the runner was killed, as life.kills finds it.
+
+    A later request calls a restart off. systemd records the end before it runs what writes
+    `failure`.
+    """
     exited = life.last("process-exited")
-    return min(failure.at_us, exited.at_us) if exited else failure.at_us
+    killed_us = min(failure.at_us, exited.at_us) if exited else failure.at_us
+    return any(one.at_us <= killed_us for one in life.all("stop-asked", "unit-stopping"))
 
 
 def _unit_failure(life: Life, end: Happening) -> Verdict:

@@ -225,6 +225,11 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
          failed("runner-killed", "the supervisor process was killed (SIGKILL)"), JOB),
         *("Stopped", Cause.STOPPED, "", "stopped by root (doractl stop); killed"),
     ),
+    "stopped by systemctl, then killed": (
+        (*RUNS, JOB, STOPPED[0], unit("process-exited", EXIT_CODE="killed", EXIT_STATUS="9"),
+         failed("runner-killed", "the supervisor process was killed (SIGKILL)")),
+        *("Stopped", Cause.STOPPED, "", f"stopped by {UNKNOWN_PERSON}; killed"),
+    ),
     "crashed during a stop": (
         (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, STOPPED[0],
          failed("runner-killed", "the supervisor process was killed (SIGSEGV)")),
