@@ -59,6 +59,11 @@ class Scope(NamedTuple):
         return f"--{self.word}"
 
     @property
+    def is_callers(self) -> bool:
+        """Whether the caller may read and change all of it: the caller is its user, or root."""
+        return self.is_user or os.geteuid() == 0
+
+    @property
     def command(self) -> str:
         """The command that acts in this scope, with sudo for a user who may not use the system's.
 

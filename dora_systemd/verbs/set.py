@@ -5,7 +5,6 @@ in a drop-in of ours next to systemd's. Drop-ins of a transient unit disappear w
 of a unit file when the file is removed.
 """
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -62,7 +61,7 @@ def set_limits(
         raise usage_error(message, "see doractl set --help")
     refuse_parts([cell], "set")
     _refuse_placed(cell, [*(one.node for one in nodes), *rates])
-    if not scope.is_user and os.geteuid() != 0:
+    if not scope.is_callers:
         message = f"cannot change the limits of {cell.name}: permission denied"
         raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
     _check_nodes(scope, cell, nodes, rates)

@@ -49,7 +49,7 @@ def connect(scope: Scope, for_reading: bool, seconds: float = 0) -> Any:
     # some milliseconds for each connection to it, and it is only on the bus that systemd notices
     # when a client disconnects, which hold() needs.
     has_other_way = address != private and Path(private).exists()
-    if for_reading and has_other_way and (scope.is_user or os.geteuid() == 0):
+    if for_reading and has_other_way and scope.is_callers:
         with suppress(DoraSystemdError):
             return _open(scope, address, seconds, _BUS_SECONDS)
         address = private

@@ -1,7 +1,6 @@
 """The sections of a bundle: what each file of it has, by the lists of decisions/bundles/."""
 
 import json
-import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -67,11 +66,6 @@ class Evidence:
     left_out: list[str] = field(default_factory=list)
 
     @property
-    def may_read_all(self) -> bool:
-        """Whether no permission is missing: the nodes' user and root may read all."""
-        return self.scope.is_user or os.geteuid() == 0
-
-    @property
     def is_up(self) -> bool:
         """Whether the dataflow may have processes."""
         return self.cell is not None and self.cell.has_begun
@@ -111,7 +105,7 @@ def _recording(what: Evidence) -> list[Section]:
         return []
     uuid = what.report.subject.uuid
     ring = what.ring or recording.find(what.manager, what.scope, what.cell, uuid)
-    if ring is None and what.cell is not None and not what.may_read_all:
+    if ring is None and what.cell is not None and not what.scope.is_callers:
         return [Section(recording.RECORDING, _refuse)]
     return recording.sections(ring, what.left_out, what.want_pictures)
 
@@ -164,7 +158,7 @@ def _status(what: Evidence) -> CellStatus | None:
 
 def _nodes(what: Evidence) -> dict[str, Any]:
     status = _status(what)
-    if status is None and not what.may_read_all:
+    if status is None and not what.scope.is_callers:
         _refuse()
     return kept_status(status or CellStatus())
 

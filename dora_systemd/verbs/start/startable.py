@@ -122,7 +122,6 @@ def check_credentials(scope: Scope, files: Mapping[str, str]) -> None:
     reads them at every start, and follows the path each time: if others could replace a part of the
     path by a link, nodes would get any file that root can read. So only root may be able to.
     """
-    is_reader = scope.is_user or os.geteuid() == 0
     total = 0
     for name, file in files.items():
         try:
@@ -130,7 +129,7 @@ def check_credentials(scope: Scope, files: Mapping[str, str]) -> None:
             if not scope.is_user:
                 _check_firm(name, file)
         except PermissionError as error:
-            if is_reader:
+            if scope.is_callers:
                 reason, hint = "permission denied", "let the calling user read it"
                 raise _refusal(name, file, reason, hint, ExitCode.NO_PERMISSION) from error
         except OSError as error:
