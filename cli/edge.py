@@ -87,14 +87,15 @@ def with_target(text: str, host: str, scope: str = "") -> str:
         return text
     verbs = "|".join(VERBS)
     scopes = "--(?:system|user)"
+    # Who requested something, as in "root (doractl stop)" and "by doractl start", is no command.
+    record = rf"\bby doractl |\S \(doractl (?:node )?(?:{verbs})\)"
     command = (
-        rf"(\bby \S+ \(|\bon \S+: |\bsudo )?\bdoractl (?:({scopes}) )?"
-        rf"({verbs})\b(?=( {scopes}\b)?)"
+        rf"{record}|(\bon \S+: |\bsudo )?\bdoractl (?:({scopes}) )?({verbs})\b(?=( {scopes}\b)?)"
     )
 
     def there(found: re.Match[str]) -> str:
         before, given, verb, behind = found.groups("")
-        if before.startswith("by "):  # as in "stopped by root (doractl stop)": stays
+        if not verb:
             return found[0]
         # With sudo the scope is the system's; in "doractl list --system" it is behind the verb.
         has_scope = before == "sudo " or behind

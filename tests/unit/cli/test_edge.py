@@ -17,7 +17,16 @@ from dora_systemd.cli.edge import Edge, with_target, write_view
         ("the same version of doractl on both", "the same version of doractl on both"),
         ("doractl: no dataflow named 'x'", "doractl: no dataflow named 'x'"),
         ("doractl -H c why x", "doractl -H c why x"),
-        ("stopped by root (doractl stop)", "stopped by root (doractl stop)"),
+        *(
+            (record, record)
+            for record in (
+                "stopped by root (doractl stop)",
+                "stopped by root, by sudo of ann (doractl node stop)",
+                '"by": "root (doractl bundle)"',
+                "it runs from /a.yml, started by doractl start",
+                "# Written by doractl set.",
+            )
+        ),
         ("hint: on head: doractl stop robot", "hint: on head: doractl stop robot"),
         ("the gateway, see doractl env", "the gateway, see doractl env on a@b:7"),
         ("or doractl --user env for it", "or doractl --user env on a@b:7 for it"),
