@@ -29,10 +29,13 @@ _CHUNK = 256 * 1024
 
 
 class Spool:
-    """The contents of files, in one file without a name. All methods raise OSError."""
+    """The contents of files, in one file without a name, below `directory`.
 
-    def __init__(self, fd: int) -> None:
-        self._fd = fd
+    All methods raise DoraSystemdError if the directory cannot be used.
+    """
+
+    def __init__(self, fd: int, directory: Path) -> None:
+        self._fd, self._directory = fd, directory
         self._places: dict[str, int] = {}
         self._end = 0
 
@@ -50,8 +53,9 @@ class Spool:
 
     def _put(self, chunk: bytes, at: int) -> int:
         done = 0
-        while done < len(chunk):
-            done += os.pwrite(self._fd, chunk[done:], at + done)
+        with _usable(self._directory):
+            while done < len(chunk):
+                done += os.pwrite(self._fd, chunk[done:], at + done)
         return done
 
     def share(self, path: str, release_id: str, stored: Stored) -> bool:
@@ -67,18 +71,29 @@ class Spool:
     def read(self, one: Stored) -> Iterator[bytes]:
         at = self._places[one.digest]
         end = at + one.size
-        while at < end and (chunk := os.pread(self._fd, min(_CHUNK, end - at), at)):
+        while at < end and (chunk := self._get(min(_CHUNK, end - at), at)):
             at += len(chunk)
             yield chunk
+
+    def _get(self, size: int, at: int) -> bytes:
+        with _usable(self._directory):
+            return os.pread(self._fd, size, at)
 
 
 @contextlib.contextmanager
 def spooled() -> Iterator[Spool]:
     """A spool until the end of the block. Raises DoraSystemdError if there is no space for it."""
     directory = Path(os.environ.get("TMPDIR") or _DIRECTORY)
+    with contextlib.ExitStack() as opened:
+        with _usable(directory):
+            file = opened.enter_context(tempfile.TemporaryFile(dir=directory))
+        yield Spool(file.fileno(), directory)
+
+
+@contextlib.contextmanager
+def _usable(directory: Path) -> Iterator[None]:
     try:
-        with tempfile.TemporaryFile(dir=directory) as file:
-            yield Spool(file.fileno())
+        yield
     except OSError as error:
         raise unusable(directory, error) from error
 

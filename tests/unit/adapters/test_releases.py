@@ -16,6 +16,7 @@ from dora_systemd.adapters.releases.store import (
     remove_tree,
     store_root,
 )
+from dora_systemd.adapters.releases.transfer import Spool, spooled
 from dora_systemd.decisions.releases.manifest import Manifest, Stored
 from dora_systemd.decisions.releases.past import Known
 from dora_systemd.errors import DoraSystemdError
@@ -219,3 +220,12 @@ def test_a_disk_that_takes_half_a_file_is_an_error(store: Store) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         draft.discard()
+
+
+def test_only_errors_of_the_spool_name_its_directory(tmp_path: Path) -> None:
+    with pytest.raises(BrokenPipeError), spooled():
+        raise BrokenPipeError  # as of standard output
+    full = os.open("/dev/full", os.O_WRONLY)
+    with contextlib.closing(os.fdopen(full, "wb")), pytest.raises(DoraSystemdError) as refused:
+        Spool(full, tmp_path).write("", [b"x"], is_executable=False)
+    assert refused.value.message == f"cannot use {tmp_path}: No space left on device"
