@@ -76,6 +76,9 @@ def _restart_words(row: DataflowRow) -> str:
 
 def _status_words(row: DataflowRow) -> str:
     text = stopping_words(row.nodes) or row.text
+    word = row.status.lower()
+    if text == word or text.startswith((f"{word}, ", f"{word} for ")):
+        text = text.removeprefix(word).lstrip(", ")
     return f"{row.status} ({text})" if text else row.status
 
 

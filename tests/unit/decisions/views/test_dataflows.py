@@ -134,6 +134,20 @@ def test_what_a_stop_waits_for() -> None:
     assert "Stopping (2/2 nodes running)" in format_dataflow(usual)
 
 
+@pytest.mark.parametrize(
+    ("status", "text", "words"),
+    [
+        ("Stopping", "stopping", "Stopping"),
+        ("Stopping", "stopping, waiting for a", "Stopping (waiting for a)"),
+        ("Waiting", "waiting for machine b (off)", "Waiting (for machine b (off))"),
+        ("Failed", "failed to start", "Failed (failed to start)"),
+    ],
+)
+def test_no_status_is_said_twice(status: str, text: str, words: str) -> None:
+    row = ROWS[1]._replace(status=status, text=text)
+    assert f"\nStatus:   {words}\n" in format_dataflow(row)
+
+
 def test_table_with_what_has_ended() -> None:
     rows = [ROWS[0], ENDED, ROWS[1]._replace(uuid=C, status="Stopped")]
     header, up, failed, stopped = format_dataflows(rows).splitlines()
