@@ -15,7 +15,7 @@ from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope
 from dora_systemd.trust.locks import find_lock, open_lock, place_of, take_lock, write_reason
-from dora_systemd.verbs.facts.cells import Cell, read_cells, restart_due
+from dora_systemd.verbs.facts.cells import Cell, read_cells, refuse_parts, restart_due
 from dora_systemd.verbs.facts.locks import holders_of, read_cell_flocks, read_holders
 
 RENEW_SECONDS = 1.0
@@ -64,6 +64,7 @@ class Lock:
 
 def take_inhibiting(scope: Scope, cell: Cell, reason: str) -> Lock:
     """Lock a running dataflow, and record that as an event. Raises DoraSystemdError."""
+    refuse_parts([cell], "inhibit")  # the head looks at its own lock only
     if not cell.has_begun:
         message = f"cannot inhibit {cell.name}: it is not running"
         raise DoraSystemdError(message, f"doractl start {cell.name}", ExitCode.NOT_RUNNING)

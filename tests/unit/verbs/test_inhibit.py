@@ -303,3 +303,12 @@ def test_what_does_not_run_cannot_be_inhibited(scope: ScopeIn, manager: FakeMana
     with pytest.raises(DoraSystemdError, match="it waits for its restart") as caught:
         take_inhibiting(scope, cell, "x")
     assert caught.value.code is ExitCode.NOT_RUNNING
+
+
+def test_a_part_cannot_be_inhibited(scope: ScopeIn, manager: FakeManager, lock: Path) -> None:
+    manager.add(options(machine="gpu", head="robot-1"))
+    (cell,) = read_cells(manager)
+    with pytest.raises(DoraSystemdError, match="cannot inhibit robot here") as caught:
+        take_inhibiting(scope, cell, "x")
+    assert caught.value.hint == "on robot-1: doractl inhibit robot"
+    assert not lock.read_text()
