@@ -154,7 +154,8 @@ def refuse_attached(cell: Cell) -> None:
 def refuse_member(options: RunnerOptions) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a part of a dataflow: its head starts it."""
     if options.machine:
-        raise no_unit_file(options.name, "its head is another machine", "use doractl enable there")
+        there = f"on {options.head or 'head'}: doractl enable {options.name}"
+        raise no_unit_file(options.name, "its head is another machine", there)
 
 
 def _refuse_other_version(cell: Cell) -> None:

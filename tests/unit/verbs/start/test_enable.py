@@ -367,3 +367,10 @@ def test_no_boot_check_for_users(manager: FakeManager, tmp_path: Path) -> None:
         enable_cell(manager, user, cell, is_checked=True)
     assert caught.value.code is ExitCode.USAGE
     assert not path_of(manager).exists()
+
+
+def test_a_part_is_enabled_on_its_head(manager: FakeManager, scope: Scope) -> None:
+    manager.add(options(machine="gpu", head="robot-1"))
+    with pytest.raises(DoraSystemdError, match="its head is another machine") as caught:
+        enable_cell(manager, scope, Selector("robot").find(manager))
+    assert caught.value.hint == "on robot-1: doractl enable robot"
