@@ -169,14 +169,18 @@ def _is_disabled(manager: Manager, scope: Scope, copy: Path) -> bool:
 
 
 def end_links_of(manager: Manager, cells: Sequence[Cell]) -> None:
-    """End the links of those that were the head of several machines."""
-    known = (one.known_options for one in cells)
-    heads = [one.name for one in known if one and one.placed and not one.machine]
-    if heads:
+    """End the links of those that were the head of several machines, and have ended.
+
+    Another command may have restarted a head instead: that needs its links.
+    """
+    known = ((cell.unit, cell.known_options) for cell in cells)
+    heads = [(unit, one.name) for unit, one in known if one and one.placed and not one.machine]
+    ended = [name for unit, name in heads if is_at_rest(manager.read(unit, ["ActiveState", "Job"]))]
+    if ended:
         # Imported late: most dataflows run on one machine.
         from dora_systemd.verbs.start.start import end_links
 
-        for name in heads:
+        for name in ended:
             end_links(manager, name)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.journal.note import caller, send_note
+from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.scope import Scope
@@ -108,6 +109,20 @@ def test_stop_that_was_cancelled() -> None:
     manager.job_results[UNIT] = "canceled"
     (outcome,) = stop_cells(manager, SCOPE, read_cells(manager))
     assert outcome.problem == f"cannot stop {UNIT}: the job was canceled"
+
+
+@pytest.mark.parametrize("is_restarted", [False, True])
+def test_the_links_of_a_head_end_with_it(is_restarted: bool) -> None:
+    """A restart that has replaced the stop would start without links, and wait for ever."""
+    manager, link = FakeManager(), "doralink-robot:gpu.service"
+    manager.add(options(placed=(Placed("yolo", "gpu"),)))
+    manager.units[link] = {**manager.units[UNIT], "Description": link}
+    manager.after_job[UNIT] = {"ActiveState": "inactive"}
+    if is_restarted:
+        manager.job_results[UNIT] = "canceled"
+        manager.after_job[UNIT] = {"ActiveState": "deactivating", "Job": [7, "/job"]}
+    stop_cells(manager, SCOPE, read_cells(manager))
+    assert (("StopUnit", link) in manager.calls) is not is_restarted
 
 
 @pytest.mark.parametrize(
