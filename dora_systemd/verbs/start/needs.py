@@ -93,7 +93,8 @@ def _check_mount(manager: Manager, plan: Needy, path: str) -> None:
     """A path needs a unit that mounts it: without one, systemd would wait for nothing."""
     places = [PurePosixPath(path), *PurePosixPath(path).parents][:-1]
     if not any(_is_mount(manager, str(place)) for place in places):
-        reason = f"nothing is mounted at {shown(path)} or above it"
+        # Not "nothing is mounted": systemd has no units for /, /proc and the like.
+        reason = f"systemd has no mount unit for {shown(path)}, or for a directory above it"
         raise _refusal(plan, f"{MOUNT}{path}", reason, "add it to /etc/fstab, see fstab(5)")
 
 

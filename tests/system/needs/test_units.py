@@ -81,7 +81,7 @@ def test_bad_needs_are_refused_before_anything_starts(cell: Cell, project: Proje
     assert "cannot wait for 'netwrok'" in refusal(cell, project, "netwrok")
     assert "wait for each other" in refusal(cell, project, f"dataflow:{cell.name}")
     assert "unit no-such.service is not-found" in refusal(cell, project, "unit:no-such.service")
-    assert "nothing is mounted" in refusal(cell, project, "mount:/mnt/nowhere")
+    assert "no mount unit" in refusal(cell, project, "mount:/mnt/nowhere")
     assert "no such node" in refusal(cell, project, "camera:needs=/dev/video0", "--node")
     assert "a path is what a node needs" in refusal(cell, project, "/dev/video0")
 

@@ -58,6 +58,13 @@ def test_two_that_need_each_other_are_named_before_one_was_started(name: str, ot
     assert f"if {other} needs {name}, they wait for each other" in caught.value.hint
 
 
+def test_a_mount_needs_a_unit() -> None:
+    """/proc is mounted, but not by a unit."""
+    with pytest.raises(DoraSystemdError) as caught:
+        check_needs(FakeManager(), Needy("arm", False, ("mount:/proc",)))
+    assert "systemd has no mount unit for /proc, or for a directory above it" in str(caught.value)
+
+
 def test_what_needs_a_dataflow_ends_with_it() -> None:
     """Also what needs it because of another one; what does not run is none of them."""
     manager = FakeManager()
