@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import click
 
-from dora_systemd.cli.edge import print_error, print_warning, remember_scope
+from dora_systemd.cli.edge import Edge, print_error, print_warning, remember_scope
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope, scope_of
@@ -155,6 +155,13 @@ serial_option = click.option(
     help="With -H: N hosts at a time, and none after a failed trial; default: 1.",
 )
 """Option for verbs that bring a release to hosts."""
+
+
+def refuse_serial(serial: int) -> None:
+    """Raise DoraSystemdError (USAGE) for --serial on a command line without -H."""
+    if serial > 1 and not Edge.reached_as:
+        hint = "leave it out, or name hosts: -H HOST,..."
+        raise usage_error(f"cannot use --serial {serial} without -H", hint)
 
 
 def current_scope(context: click.Context | None = None) -> Scope:

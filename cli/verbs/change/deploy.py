@@ -17,6 +17,7 @@ from dora_systemd.cli.parameters import (
     name_option,
     print_json,
     print_outcomes,
+    refuse_serial,
     serial_option,
     tell,
     waiting_option,
@@ -103,7 +104,7 @@ def command(
       doractl deploy --dry-run                files that differ from the last one
       doractl -H base,arm deploy /srv/robot   one host after the other
     """
-    del serial  # for -H, see cli/remote/
+    refuse_serial(serial)
     if not build_timeout:
         hint = "write a time such as 30min, or --no-build"
         raise usage_error("cannot use 0 as --build-timeout", hint)

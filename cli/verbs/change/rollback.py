@@ -9,6 +9,7 @@ from dora_systemd.cli.parameters import (
     current_scope,
     duration_option,
     print_outcomes,
+    refuse_serial,
     serial_option,
     waiting_option,
 )
@@ -47,7 +48,7 @@ def command(
       doractl rollback robot
       doractl rollback robot 20261121T220012-9f3c1a2
     """
-    del serial  # for -H, see cli/remote/
+    refuse_serial(serial)
     how = if_inhibited(force, wait)
     scope = current_scope()
     with open_progress(is_quiet) as progress:

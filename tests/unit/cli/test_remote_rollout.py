@@ -233,3 +233,9 @@ def test_releases(capsys: Printed) -> None:
         make_program(Path(os.environ["PATH"].partition(":")[0]) / "doractl", f"echo '{wrong}'")
         assert main.run(["releases", "-H", "h1,h2"]) == ExitCode.NO_HOST
         assert "cannot read the answer of h1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", [["deploy"], ["rollback", "robot"]])
+def test_hosts_at_a_time_need_hosts(verb: list[str], capsys: Printed) -> None:
+    assert main.run([*verb, "--serial", "2"]) == ExitCode.USAGE
+    assert "cannot use --serial 2 without -H" in capsys.readouterr().err
