@@ -64,7 +64,7 @@ class Lock:
 
 def take_inhibiting(scope: Scope, cell: Cell, reason: str) -> Lock:
     """Lock a running dataflow, and record that as an event. Raises DoraSystemdError."""
-    refuse_parts([cell], "inhibit")  # the head looks at its own lock only
+    refuse_parts([cell], "inhibit")  # the head checks its own lock only
     if not cell.has_begun:
         message = f"cannot inhibit {cell.name}: it is not running"
         raise DoraSystemdError(message, f"doractl start {cell.name}", ExitCode.NOT_RUNNING)
