@@ -104,7 +104,8 @@ class Watch(NamedTuple):
 
 # Journals keep these texts, so they never change.
 TRIGGERED = "it sent WATCHDOG=trigger"
-_SAYS = {Phase.RUNNING: "no WATCHDOG=1 for ", Phase.STARTING: "not ready within "}
+LATE = "not ready within "
+_SAYS = {Phase.RUNNING: "no WATCHDOG=1 for ", Phase.STARTING: LATE}
 
 
 def missed(phase: Phase, limit: int) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dora_systemd.decisions.cell.exits import EARLY, ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import FROZEN, WAITING
+from dora_systemd.decisions.watchdog.judge import LATE, TRIGGERED
 from dora_systemd.decisions.why.verdict import Verdict
 from dora_systemd.names import release_of
 
@@ -55,6 +56,11 @@ _MEMORY_REMEDIES = {
     f"(--node NODE:memory_limit=SIZE){_SIZE}",
 }
 """Remedies by the owner of the exceeded memory limit, unless that is the node."""
+_WATCHDOG_REMEDIES = {
+    TRIGGERED: "find out why {node} sent WATCHDOG=trigger",
+    LATE: "find out what {node} waited for, or raise --start-timeout",
+}
+"""Remedies by the reason of the watchdog, where a longer watchdog changes nothing."""
 _COREDUMPCTL = "; coredumpctl info {pid} shows where it crashed"
 _NO_DUMP = "; doractl doctor says why there is no core dump that shows where it crashed"
 _SIGNAL_REMEDIES: Mapping[int, str] = {
@@ -87,6 +93,9 @@ def remedy_of(verdict: Verdict) -> str:
     if verdict.cause is Cause.NODE_FAILED and exit.kind is ExitKind.SIGNAL:
         return _SIGNAL_REMEDIES.get(exit.number, _REMEDIES[verdict.cause])
     remedy = _REMEDIES.get(verdict.cause, "")
+    if verdict.cause is Cause.NODE_WATCHDOG:
+        found = (text for reason, text in _WATCHDOG_REMEDIES.items() if reason in verdict.summary)
+        remedy = next(found, remedy)
     has_policy = verdict.policy not in ("", "no")
     return _BY_HAND if remedy == _AUTOMATIC and has_policy else remedy
 

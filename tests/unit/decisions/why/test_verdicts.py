@@ -483,6 +483,18 @@ MORE_MEMORY = f"doractl set {{name}} --memory-limit SIZE, or limit single nodes 
             "find out what {node} waited for, or raise health_check_timeout: in its YAML",
         ),
         (
+            Verdict("Failed", Cause.NODE_WATCHDOG, "node a: hung, no WATCHDOG=1 for 2s"),
+            "find out what {node} waited for, or raise watchdog: in its settings",
+        ),
+        (
+            Verdict("Failed", Cause.NODE_WATCHDOG, "node a: hung, not ready within 1min 30s"),
+            "find out what {node} waited for, or raise --start-timeout",
+        ),
+        (
+            Verdict("Failed", Cause.NODE_WATCHDOG, "node a: hung, it sent WATCHDOG=trigger"),
+            "find out why {node} sent WATCHDOG=trigger",
+        ),
+        (
             Verdict("Waiting", Cause.MACHINE_LOST),
             "nothing: it starts when all machines are there; doractl stop {name} gives up",
         ),
