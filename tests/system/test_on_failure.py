@@ -8,6 +8,7 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Timer
 
 import pytest
 
@@ -186,6 +187,24 @@ def test_a_dataflow_that_is_stopped_before_its_notice(
     ends(cell)
     assert recorded(cell, "notice-failed") == []
     shutil.rmtree(STORE / cell.name)
+
+
+@pytest.mark.warns(*FAILS)
+def test_a_start_waits_for_a_late_notice(cell: Cell, project: Project, late: Path) -> None:
+    """systemd keeps the unit of a dataflow until the service has read its setting."""
+    file = flow(project)
+    cell.start(file, *options(project))
+    crash = project.write("crash", "")
+    state = ("systemctl", "is-active", notice_unit(cell.name))
+    wait_for("the service", lambda: "activating" in run(*state, check=False).stdout)
+    cell.doractl("stop", cell.name)
+    assert cell.show("LoadState") == "loaded"
+    crash.unlink()
+    Timer(3, late.touch).start()
+    cell.start(file, "--env=A=b", *options(project))
+    assert late.exists()
+    wait_for("the notice", lambda: notices(project))
+    ends(cell)
 
 
 @pytest.mark.warns(*FAILS)

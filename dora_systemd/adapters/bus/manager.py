@@ -109,6 +109,9 @@ class Manager(Protocol):
     def hold(self, unit: str) -> None:
         """Keep systemd from unloading the unit until this client disconnects."""
 
+    def unload(self, unit: str) -> None:
+        """Have systemd check again whether it can unload an ended unit."""
+
     def awaited(self, unit: str) -> list[str]:
         """The units whose jobs the job of this unit waits for; [] if it has none (any more)."""
 

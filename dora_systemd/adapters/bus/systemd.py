@@ -16,6 +16,7 @@ anyway when the message bus restarts, so the wait also reads the state of the un
 import re
 import select
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from dora_systemd.adapters.bus.connection import (
@@ -142,6 +143,12 @@ class Bus:
     def hold(self, unit: str) -> None:
         # Before a start only, and no user knows what it is to hold a unit.
         self._call(f"start {unit}", "RefUnit", ("s", unit))
+
+    def unload(self, unit: str) -> None:
+        # systemd checks the unit when the last reference is gone.
+        with suppress(DoraSystemdError):  # it is unloaded
+            self._call(f"start {unit}", "RefUnit", ("s", unit))
+            self._call(f"start {unit}", "UnrefUnit", ("s", unit))
 
     def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
         arguments = (("s", unit), ("b", runtime), _typed(properties))

@@ -37,7 +37,7 @@ from dora_systemd.decisions.unit.file import (
     without_install,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
-from dora_systemd.names import name_from_unit, notice_hold_unit, unit_name
+from dora_systemd.names import name_from_unit, notice_hold_unit, notice_unit, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import own_directories, wanted_units
@@ -313,27 +313,32 @@ def _masks(boot: BootUnit) -> list[Path]:
 def wait_until_forgotten(manager: Manager, unit: str, most: float = _FORGET_SECONDS) -> None:
     """Wait until a transient unit is gone: systemd unloads it a moment after the last reference.
 
-    What FileDescriptorStorePreserve= keeps of it would keep the unit as well. After a failure that
-    is reported, doranotice-hold@.service keeps it for a moment.
+    What FileDescriptorStorePreserve= keeps of it would keep the unit as well. So do the services
+    that report a failure, until they have started; after that, systemd checks the unit only when
+    unload() requests it.
     """
-    begun = time.monotonic()
+    begun = last = time.monotonic()
     while (facts := manager.read(unit, _HELD))["Transient"]:
         if facts["NFileDescriptorStore"]:
             manager.close_stored(unit)
-        waited = time.monotonic() - begun
-        if waited > most and not (waited < _NOTICE_SECONDS and _is_held(manager, unit)):
-            raise DoraSystemdError(
-                f"cannot start {unit}: systemd still holds the ended one",
-                f"systemctl list-dependencies --reverse {unit}",
-                ExitCode.NAME_IN_USE,
-            )
+        manager.unload(unit)
+        now = time.monotonic()
+        if now - last > most:
+            if now - begun >= _NOTICE_SECONDS or not _is_held(manager, unit):
+                raise DoraSystemdError(
+                    f"cannot start {unit}: systemd still holds the ended one",
+                    f"systemctl list-dependencies --reverse {unit}",
+                    ExitCode.NAME_IN_USE,
+                )
+            last = now
         time.sleep(_RETRY_SECONDS)
 
 
 def _is_held(manager: Manager, unit: str) -> bool:
-    """Whether the unit waits for the service that reports its failure, see verbs/notice/."""
-    hold = notice_hold_unit(name_from_unit(unit) or "")
-    return bool(queued_job(manager.read(hold, ["Job"])))
+    """Whether a service that reports a failure of the unit is to start, see verbs/notice/."""
+    name = name_from_unit(unit) or ""
+    services = (notice_unit(name), notice_hold_unit(name))
+    return any(queued_job(manager.read(one, ["Job"])) for one in services)
 
 
 def _link(manager: Manager, name: str, unit: str) -> None:

@@ -97,6 +97,7 @@ class FakeManager:
         self.job_results: dict[str, str] = {}
         self.stages: list[str] = []
         self.held: set[str] = set()
+        self.unloaded: list[str] = []
         self.after_job: dict[str, dict[str, Any]] = {}
         self.systemd = "257.13-1"
         self.types: dict[str, str] = {}
@@ -206,6 +207,9 @@ class FakeManager:
 
     def hold(self, unit: str) -> None:
         self.held.add(unit)
+
+    def unload(self, unit: str) -> None:
+        self.unloaded.append(unit)
 
     def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
         self.calls.append(("set", unit, list(properties), runtime))

@@ -253,13 +253,15 @@ class Held(FakeManager):
 
 
 @pytest.mark.parametrize("job", [0, 7])
-def test_a_start_waits_for_the_notice_of_a_failure(job: int) -> None:
+@pytest.mark.parametrize("service", ["doranotice-hold@robot.service", "doranotice@robot.service"])
+def test_a_start_waits_for_the_notice_of_a_failure(service: str, job: int) -> None:
     """As long as the service starts that reads the setting of the dataflow, and no longer."""
     manager = Held()
     unit = manager.add(options(), active="inactive")
-    manager.units["doranotice-hold@robot.service"] = {"Job": [job, "/"]}
+    manager.units[service] = {"Job": [job, "/"]}
     if job:
         wait_until_forgotten(manager, unit, 0)
+        assert unit in manager.unloaded
         return
     with pytest.raises(DoraSystemdError, match="systemd still holds the ended one"):
         wait_until_forgotten(manager, unit, 0)
