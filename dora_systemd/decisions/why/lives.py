@@ -19,6 +19,7 @@ from dora_systemd.decisions.logs.query import (
     UNIT_STOPPING,
 )
 from dora_systemd.decisions.views.facts import NodeRow
+from dora_systemd.names import is_node_id
 
 # https://github.com/systemd/systemd/blob/main/src/systemd/sd-messages.h
 UNIT_MESSAGES = {
@@ -121,18 +122,24 @@ def parse_happening(record: Mapping[str, Any]) -> Happening | None:
     if not name:
         return None
     own = {k[5:].lower(): text for k, text in texts.items() if k.startswith("DORA_")}
+    own |= {key: _node_ids(own[key]) for key in ("node", "nodes") if key in own}
     systemd = {key.lower(): texts[key] for key in _SYSTEMD_FIELDS if key in texts}
     keys = ("_SYSTEMD_INVOCATION_ID", "INVOCATION_ID", "USER_INVOCATION_ID")
     ids = keys if "DORA_EVENT" in texts else keys[1:]
     return Happening(
         name,
         parse_number(texts.get("__REALTIME_TIMESTAMP", "")) or 0,
-        texts.get("DORA_NODE", ""),
+        own.get("node", ""),
         texts.get("MESSAGE", ""),
         next((texts[key] for key in ids if texts.get(key)), ""),
         texts.get("_BOOT_ID", ""),
         {**systemd, **own},
     )
+
+
+def _node_ids(text: str) -> str:
+    """The valid ids of nodes in a field: a remedy names them in commands."""
+    return " ".join(filter(is_node_id, text.split()))
 
 
 def parse_number(text: str) -> int | None:

@@ -26,6 +26,7 @@ from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING,
 from dora_systemd.decisions.watchdog.judge import by_watchdog
 from dora_systemd.decisions.why.lives import Happening, Life, ended_nodes, with_restarts
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
+from dora_systemd.names import is_node_id
 from dora_systemd.values import SECOND
 
 _LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST, Cause.MACHINE_LOST)
@@ -140,7 +141,7 @@ def _present(life: Life, facts: Facts) -> Verdict:
         if is_starved:  # who sends nothing to it is to blame
             origin = source.partition("/")[0]
             words = f"node {origin}: sends nothing; {node}: {missing}"
-            return _found(Cause.NODE_SILENT, words, at, origin)
+            return _found(Cause.NODE_SILENT, words, at, origin if is_node_id(origin) else node)
         return _found(Cause.NODE_SILENT, f"node {node}: {missing}", at, node)
     return _found(Cause.NONE, "")
 

@@ -20,6 +20,7 @@ from dora_systemd.decisions.why.lives import (
 from dora_systemd.decisions.why.postmortem import (
     UNKNOWN_PERSON,
     ended_word,
+    examine,
     final_crashes,
     restarts_of,
     stopped_by,
@@ -384,6 +385,16 @@ def test_a_record_of_ours() -> None:
     }
     assert one.detail("exit") == "exit code 1"
     assert one.detail("owner") == ""
+
+
+def test_the_name_of_a_node_cannot_be_a_command() -> None:
+    """A node can write any record of its dataflow, and `why` names nodes in commands."""
+    forged = {"DORA_EVENT": "node-crashed", "DORA_NODE": "$(id)"}
+    assert (one := parse_happening(forged)) and not (one.node or one.detail("node"))
+    end = {"DORA_EVENT": "dataflow-failed", "DORA_NODES": "a ;id b"}
+    assert (one := parse_happening(end)) and one.detail("nodes") == "a b"
+    silent = Facts("Degraded", silent={"a": "no line for 2s, starved of $(id)/image"})
+    assert examine([Life()], silent).node == "a"
 
 
 @pytest.mark.parametrize("key", ["INVOCATION_ID", "USER_INVOCATION_ID"])
