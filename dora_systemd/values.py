@@ -6,6 +6,7 @@ message, and keep the hint.
 """
 
 import re
+import shlex
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -61,6 +62,11 @@ def quoted(text: str) -> str:
 def shown(text: str) -> str:
     """`text` for a message, with quotes only if necessary: for paths and file names."""
     return text if text.isprintable() and text.strip() == text and text else quoted(text)
+
+
+def shell_word(text: str) -> str:
+    """`text` as one word of a command that a hint names: a path may contain a command, too."""
+    return shlex.quote(text if text.isprintable() else shown(text))
 
 
 def counted(count: int, what: str) -> str:

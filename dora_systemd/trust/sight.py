@@ -20,7 +20,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust import eyes
 from dora_systemd.trust.files import MAX_BYTES
 from dora_systemd.trust.programs import Account, end_child, spawn
-from dora_systemd.values import shown
+from dora_systemd.values import shell_word, shown
 
 _SECONDS = 5.0
 """Timeout in seconds for all answers together: a mount of the account may hang, and the account may
@@ -183,7 +183,8 @@ def cannot_reach(user: str, path: str) -> DoraSystemdError:
     """The error for a path that the user of a dataflow cannot access."""
     message = f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}"
     way = "move it, chmod a+rX what is closed, or choose another user with --uid"
-    return DoraSystemdError(message, f"see namei -l {shown(path)}: {way}", ExitCode.NO_PERMISSION)
+    hint = f"see namei -l {shell_word(path)}: {way}"
+    return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
 
 
 def send(fd: int, data: bytes, deadline: float) -> None:

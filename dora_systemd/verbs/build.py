@@ -44,7 +44,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.trust.programs import own_account, spawn
 from dora_systemd.trust.sight import sight_of
-from dora_systemd.values import shown
+from dora_systemd.values import shell_word, shown
 from dora_systemd.verbs.facts.reason import exit_status, failure_reason
 from dora_systemd.verbs.releases.build import stopped_after_error
 from dora_systemd.verbs.releases.source import project_root
@@ -150,8 +150,8 @@ def _check_user(read: Read) -> None:
         who = "you" if user is None else f"user {user.pw_name}"
         hint = "its owner can build it, or you in a copy of your own"
         if user is not None:
-            hint = f"chown -R {user.pw_name} {shown(directory)}, or choose who builds with --uid "
-            hint += "USER; doractl deploy builds in a release"
+            hint = f"chown -R {user.pw_name} {shell_word(directory)}, or choose who builds with "
+            hint += "--uid USER; doractl deploy builds in a release"
         reason = f"{who} cannot write in {shown(directory)}"
         raise _refusal(path, reason, hint, ExitCode.NO_PERMISSION)
 

@@ -54,6 +54,7 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists, is_absent
 from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sockets import TABLES, listening_sockets
+from dora_systemd.values import shell_word
 from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.list import dataflow_row
@@ -192,7 +193,8 @@ def _enabled(path: Path, scope: Scope) -> Iterator[Finding]:
         yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
     elif runner_of(text, can_start=True) is None:
         found = f"{options.name} cannot start at boot: another version has enabled it"
-        remedy = f"doractl disable {options.name}, then doractl start --enable {options.dataflow}"
+        file = shell_word(options.dataflow)
+        remedy = f"doractl disable {options.name}, then doractl start --enable {file}"
         yield Finding("boot", State.WARNING, found, remedy)
 
 

@@ -34,7 +34,7 @@ from dora_systemd.decisions.watchdog.watchdogs import (
     watchdog_of,
 )
 from dora_systemd.errors import DoraSystemdError, bad_input
-from dora_systemd.values import INFINITY, SECOND, as_mapping, quoted, shown
+from dora_systemd.values import INFINITY, SECOND, as_mapping, quoted, shell_word, shown
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
 _BUILT = ("build", "git", "branch", "tag", "rev")
@@ -303,7 +303,7 @@ def _hint(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
 
 def _build_hint(source: str, plan: LaunchPlan) -> str:
     uv = "--uv " if plan.options.uv else ""
-    return f"run `doractl build {uv}{shown(source)}` first"
+    return f"run `doractl build {uv}{shell_word(source)}` first"
 
 
 def _uv_places(directory: str, plan: LaunchPlan) -> list[str]:

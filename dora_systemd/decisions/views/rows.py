@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from dora_systemd import __version__
 from dora_systemd.decisions.views.facts import USAGE, Fact, NodeRow
 from dora_systemd.names import release_of
-from dora_systemd.values import SECOND
+from dora_systemd.values import SECOND, shell_word
 
 
 class Holder(NamedTuple):
@@ -104,7 +104,7 @@ class DataflowRow(NamedTuple):
         if self.options_problem:
             # A restart would start the same command line, which the installed runner refuses.
             flag = "--enable " if self.enabled else ""
-            todo = f"doractl start {flag}--name {self.name} {self.dataflow}"
+            todo = f"doractl start {flag}--name {self.name} {shell_word(self.dataflow)}"
             todo = f"doractl stop {self.name}, then {todo}" if self.is_up else todo
             todo = "deploy its project again" if self.release else todo
             return f"another version has started it: {self.options_problem}", todo

@@ -1,7 +1,6 @@
 """What to do about each cause of an end, and about the last lines of a node. Pure."""
 
 import re
-import shlex
 import signal
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -11,6 +10,7 @@ from dora_systemd.decisions.views.dataflows import FROZEN, WAITING
 from dora_systemd.decisions.watchdog.judge import LATE, TRIGGERED
 from dora_systemd.decisions.why.verdict import Verdict
 from dora_systemd.names import release_of
+from dora_systemd.values import shell_word
 
 _BY_HAND = "run: doractl restart {name}"
 AND_RESTART = f", then {_BY_HAND}"
@@ -183,7 +183,7 @@ def _space(path: str | None, node: str) -> str:
     """The remedy for a full file system. path: of a file that could not be written."""
     if path is None:
         return f"a file system that {node} writes to is full: df shows which one"
-    return f"the file system of this file is full: df {shlex.quote(path)}"
+    return f"the file system of this file is full: df {shell_word(path)}"
 
 
 def of_release(text: str, name: str, file: str) -> str:
@@ -194,7 +194,7 @@ def of_release(text: str, name: str, file: str) -> str:
     fixed = f", then run: doractl deploy --name {name}"
     text = text.replace(f", then run: doractl restart {name}", fixed)
     if release := release_of(file):
-        inside = file.partition(f"/{release}/tree/")[2]
-        text = text.replace(f"fix {file}", f"fix {inside} in its project")
-        text = text.replace(f"doractl start {file}", f"doractl start {name}")
+        word, inside = shell_word(file), file.partition(f"/{release}/tree/")[2]
+        text = text.replace(f"fix {word}", f"fix {inside} in its project")
+        text = text.replace(f"doractl start {word}", f"doractl start {name}")
     return text

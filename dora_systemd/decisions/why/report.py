@@ -29,7 +29,7 @@ from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.decisions.why.waits import CpuWait, format_cpu_waits, wait_remedies
 from dora_systemd.names import release_of
 from dora_systemd.terminal_text import cut, one_line, wrapped
-from dora_systemd.values import SECOND, format_duration, format_rounded_size
+from dora_systemd.values import SECOND, format_duration, format_rounded_size, shell_word
 
 LINES = 20
 """Maximum number of last lines to show."""
@@ -121,10 +121,10 @@ def remedies(report: Report) -> list[str]:
         "others": ", ".join(verdict.others),
         "other": (*verdict.others, "")[0],
         "away": _away(verdict),
-        "file": subject.file or "FILE",
+        "file": shell_word(subject.file or "FILE"),
         "unit": subject.unit,
         "flag": subject.flag,
-        "pid": verdict.details.get("node_pid", "PID"),
+        "pid": parse_number(verdict.details.get("node_pid", "")) or "PID",
         "machine": machine,
         "host": host,
     }

@@ -19,7 +19,7 @@ from dora_systemd.adapters.dora.command import OLDEST_DORA, version_numbers
 from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.trust.sight import Sight, sight_of
-from dora_systemd.values import shown
+from dora_systemd.values import shell_word, shown
 from dora_systemd.verbs.facts.cells import Cell
 
 _ELF = b"\x7fELF"
@@ -111,7 +111,7 @@ def _unusable(path: str, sight: Sight, who: str) -> DoraSystemdError:
     leads = _leads(path, real)
     code = ExitCode.NO_PERMISSION
     if sight.exists(real):
-        reason, hint = f"{who} cannot execute {leads}", f"chmod a+x {shown(real)}"
+        reason, hint = f"{who} cannot execute {leads}", f"chmod a+x {shell_word(real)}"
     elif _is_gone(real, sight):
         reason, code = f"{leads} does not exist", ExitCode.BAD_INPUT
         hint = _again(path)

@@ -17,7 +17,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import is_name, is_uuid, is_uuid_prefix, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists, is_directory
-from dora_systemd.values import quoted
+from dora_systemd.values import quoted, shell_word
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 from dora_systemd.verbs.start.request import DEFAULT_FILE, current_directory
@@ -52,7 +52,7 @@ class Asked(NamedTuple):
         from dora_systemd.decisions.settings.resolve import given_texts, is_given
 
         if wanted.name not in (None, self.name):
-            hint = f"doractl start {self.dataflow} --name NAME starts one more"
+            hint = f"doractl start {shell_word(self.dataflow)} --name NAME starts one more"
             raise usage_error(f"cannot start {self.name} as {quoted(wanted.name)}", hint)
         given = frozenset(key for key, value in wanted.flags.items() if is_given(value))
         flags = given_texts(wanted.flags, {}, current_directory(), self.flags)
@@ -143,7 +143,8 @@ def find_start(
     if found := find_asked(scope, Selector(cell.name)):
         return found
     message = f"cannot change settings of {cell.name}: the journal does not have its start"
-    raise DoraSystemdError(message, f"doractl start {cell.options.dataflow} takes the file itself")
+    file = shell_word(cell.options.dataflow)
+    raise DoraSystemdError(message, f"doractl start {file} takes the file itself")
 
 
 def _without_start(scope: Scope, selector: Selector) -> DoraSystemdError | None:
@@ -176,7 +177,7 @@ def _readable(scope: Scope, selector: Selector) -> Asked | None:
 
 def _refuse_released(scope: Scope, asked: Asked) -> None:
     if release := _committed(scope, asked.name):
-        raise _disabled(asked.name, release, f", or doractl start {asked.dataflow}")
+        raise _disabled(asked.name, release, f", or doractl start {shell_word(asked.dataflow)}")
 
 
 def _disabled(name: str, release: str, otherwise: str = "") -> DoraSystemdError:

@@ -23,7 +23,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import reached
 from dora_systemd.trust.sight import Sight
-from dora_systemd.values import shown
+from dora_systemd.values import shell_word, shown
 from dora_systemd.verbs.start.programs import version_trouble
 from dora_systemd.verbs.start.where import Look, Where
 
@@ -68,14 +68,15 @@ def plan_notes(scope: Scope, look: Look, dataflow: Dataflow, launch: LaunchPlan)
         nodes = f"node{'s' if len(dynamic) > 1 else ''} {', '.join(dynamic)}"
         variables = f'eval "$(doractl {scope.flag} env {launch.options.name})"'
         yield f"start the dynamic {nodes} in another terminal, after: {variables}"
-    path, uv = shown(dataflow.source), "--uv " if launch.options.uv else ""
+    path = shown(dataflow.source)
+    build = f"doractl build {'--uv ' if launch.options.uv else ''}{shell_word(dataflow.source)}"
     if not any(one.build or one.git for one in dataflow.nodes):
         return
     # `dora run` always builds first.
     if not launch.session.directories:
-        yield f"no build of {path} is found; to build it: doractl build {uv}{path}"
+        yield f"no build of {path} is found; to build it: {build}"
     elif _is_build_old(dataflow, look.sight):
-        yield f"{path} is newer than its last build; to build again: doractl build {uv}{path}"
+        yield f"{path} is newer than its last build; to build again: {build}"
 
 
 def start_warnings(where: Where, dataflow: Dataflow, sight: Sight) -> Iterator[str]:
@@ -100,7 +101,7 @@ def unbuilt_warnings(options: RunnerOptions, sight: Sight) -> Iterator[str]:
     places = dict.fromkeys((str(Path(options.dataflow).parent), options.working_directory))
     locked = find_lock(places, sight.exists)
     if locked and options.venv is None and not options.uv:  # else uv makes it
-        build = f"doractl build {shown(options.dataflow)}"
+        build = f"doractl build {shell_word(options.dataflow)}"
         yield f"{shown(locked)} has {LOCK} and the nodes have no .venv; to make it: {build}"
 
 

@@ -1,5 +1,7 @@
 """Sizes, durations, CPU shares and booleans: there and back, and nothing but our error."""
 
+import shlex
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,6 +19,7 @@ from dora_systemd.values import (
     parse_duration,
     parse_size,
     quoted,
+    shell_word,
     shown,
 )
 
@@ -156,6 +159,15 @@ def test_quoted_text_is_short_and_plain(text: str) -> None:
     assert quoted(text).isprintable()
     assert shown(text).isprintable()
     assert shown(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["/home/a/x; touch /y", "/a $(id)", "it's `id`", "/a\nid", "'$(id)\x1b", "", "/a"]
+)
+def test_a_path_in_a_command_is_one_word_of_it(text: str) -> None:
+    words = shlex.split(shell_word(text))
+    assert words in ([text], [shown(text)])
+    assert shell_word(text).isprintable()
 
 
 def test_plain_paths_are_shown_as_they_are() -> None:

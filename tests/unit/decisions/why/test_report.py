@@ -464,6 +464,24 @@ def test_what_to_do_about_one_that_is_gone() -> None:
     assert remedies(unknown) == ["fix camera, then run: doractl start FILE --name robot"]
 
 
+@pytest.mark.parametrize("cause", [Cause.BAD_DATAFLOW, Cause.NO_END, Cause.OTHER_VERSION])
+@pytest.mark.parametrize("is_loaded", [True, False])
+def test_a_path_that_is_a_command_is_quoted(cause: Cause, is_loaded: bool) -> None:
+    subject = replace(SUBJECT, file="/home/a/x; id/robot.yml", is_loaded=is_loaded)
+    verdict = replace(VERDICT, cause=cause, details={})
+    (text,) = remedies(replace(FULL, subject=subject, verdict=verdict))
+    assert "'/home/a/x; id/robot.yml'" in text
+    assert text.count("x; id") == text.count("'/home/a/x; id/robot.yml'")
+
+
+def test_a_process_that_is_no_number_is_not_named() -> None:
+    details = {"exit": "signal SIGSEGV", "node_pid": "7; id"}
+    verdict = replace(VERDICT, cause=Cause.NODE_FAILED, details=details)
+    assert remedies(replace(FULL, verdict=verdict)) == [
+        "fix camera; coredumpctl info PID shows where it crashed"
+    ]
+
+
 def test_what_waits_for_its_file() -> None:
     held = replace(FULL, verdict=DEGRADED, is_held=True)
     assert remedies(held) == [

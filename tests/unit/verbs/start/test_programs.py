@@ -139,6 +139,16 @@ def test_a_program_without_the_permission(tmp_path: Path) -> None:
         check_program(str(path), Sight(), None)
 
 
+def test_a_program_whose_name_is_a_command(tmp_path: Path) -> None:
+    """Root may paste the hint into a shell."""
+    path = tmp_path / "a; id"
+    make_program(path)
+    path.chmod(0o644)
+    with pytest.raises(DoraSystemdError) as caught:
+        check_program(str(path), Sight(), None)
+    assert caught.value.hint == f"chmod a+x '{path}'"
+
+
 def install(prefix: Path, wheel: str, version: str, python: str = "python3.13") -> str:
     """A wheel in a prefix, which it returns."""
     (prefix / f"lib/{python}/site-packages/{wheel}-{version}.dist-info").mkdir(parents=True)
