@@ -87,6 +87,7 @@ class JournalReader:
 
     def __init__(self, bounds: Bounds = _BOUNDS) -> None:
         self._bounds = bounds
+        self.is_cut = False  # whether the bounds have ended the last newest()
 
     def unique(self, field: str) -> list[str]:
         """Return all values of `field` in the journal, sorted."""
@@ -175,8 +176,12 @@ class JournalReader:
         options += ["--all"] if is_whole else []
         options += [f"--output-fields={','.join(fields)}"] if fields else []
         words = ["--output=json", "--reverse", "--quiet", *options, "--", *matches]
-        for line in _lines(words, self._bounds):
+        self.is_cut = False
+        for line in _lines(words, self._bounds, self._cut):
             yield json.loads(line)
+
+    def _cut(self) -> None:
+        self.is_cut = True
 
     def last_events(
         self, scope: Scope, limit: int = 100, name: str = "", is_by_name: bool = False
@@ -232,11 +237,13 @@ def read_when_written(read: Callable[[], T], is_behind: Callable[[T], bool]) -> 
     return found
 
 
-def _lines(arguments: Sequence[str], bounds: Bounds) -> Iterator[bytes]:
+def _lines(
+    arguments: Sequence[str], bounds: Bounds, cut: Callable[[], object] = bool
+) -> Iterator[bytes]:
     """The lines that journalctl prints, within limits. Raises DoraSystemdError for its error.
 
     Every node can write to the journal, and fill it with records of 32 MiB each. So this leaves out
-    lines that are too long, and ends after so many bytes or the timeout.
+    lines that are too long, and ends after so many bytes or the timeout. cut: is called then.
     """
     with open_journalctl(arguments) as child:
         assert child.stdout
@@ -261,6 +268,7 @@ def _lines(arguments: Sequence[str], bounds: Bounds) -> Iterator[bytes]:
             rest = (rest + last)[: MAX_LINE + 1]
         else:
             child.kill()
+            cut()
             if left < bounds.size:
                 return  # what it has complained of is no reason to show nothing
         end_journalctl(child)

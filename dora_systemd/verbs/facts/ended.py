@@ -1,8 +1,10 @@
 """Finds dataflows that have ended: what systemd still knows of them, and the journal."""
 
 import contextlib
+import time
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -24,6 +26,7 @@ from dora_systemd.verbs.facts.reason import failure_reason
 
 _WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _MOST_NAMES = 100
+_HIDDEN_SECONDS = 5.0
 _TIMES = ("InactiveEnterTimestamp", "InactiveExitTimestamp", "ExecMainStartTimestamp")
 
 
@@ -126,9 +129,27 @@ def ended_row(event: LastEvent) -> DataflowRow:
 def _last_events(scope: Scope, **what: Any) -> list[LastEvent]:
     # Without access to the journal, the rows from systemd are still shown.
     with contextlib.suppress(DoraSystemdError):
-        events = JournalReader().last_events(scope, **what)
+        journal = JournalReader()
+        events = journal.last_events(scope, **what)
+        if journal.is_cut and "name" not in what:
+            events += _hidden(scope, {event.name for event in events})
+            events.sort(key=lambda event: -event.at_us)
         return _with_later_failures(scope, _remembered(scope, events) if events else [])
     return []
+
+
+def _hidden(scope: Scope, known: set[str]) -> list[LastEvent]:
+    """The last event of each dataflow that is not in `known`, read by its unit.
+
+    The nodes of one dataflow can write so many life events that a reading of all ends before
+    those of the others.
+    """
+    journal, found = JournalReader(), list[LastEvent]()
+    deadline = time.monotonic() + _HIDDEN_SECONDS
+    for name in islice(journal.known_names(scope), _MOST_NAMES):
+        if name not in known and time.monotonic() < deadline:
+            found += journal.last_events(scope, 1, name)
+    return found
 
 
 def _remembered(scope: Scope, events: list[LastEvent]) -> list[LastEvent]:

@@ -101,6 +101,12 @@ def test_a_node_that_fills_the_journal_hides_no_other(journal: FakeJournal) -> N
     assert [row.name for row in ended_rows(SCOPE)] == ["full", "gone"]
 
 
+def test_a_node_that_forges_more_events_than_are_read_hides_no_other(journal: FakeJournal) -> None:
+    forged = life_record("dataflow-failed", 50, "full", DORA_REASON="x" * 500_000)
+    journal.write(*[forged] * 80, life_record("dataflow-stopped", 30, "gone", OTHER))
+    assert [row.name for row in ended_rows(SCOPE)] == ["full", "gone"]
+
+
 @pytest.mark.parametrize(
     ("began", "result", "shown"),
     [
