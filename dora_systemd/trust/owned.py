@@ -14,6 +14,7 @@ from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust import scribe
+from dora_systemd.trust.paths import Place
 from dora_systemd.trust.programs import account_of_uid, end_child, spawn
 from dora_systemd.trust.sight import receive, send
 from dora_systemd.values import shown
@@ -22,6 +23,21 @@ _SECONDS = 30.0
 _REFUSALS = (os.strerror(errno.EACCES), os.strerror(errno.EPERM))
 _LONGEST = 200
 """Maximum bytes of a reason: that user can send any text, which the edge of doractl escapes."""
+
+
+def writer_of(place: Place) -> int:
+    """The uid for replace_file(): the owner of a file, or of a directory above a file of root.
+
+    That directory can become a link while root writes. Raises DoraSystemdError (NO_PERMISSION) if
+    several users could do that.
+    """
+    strangers = sorted(place.owners - {0})
+    if place.uid or not place.borrowed or os.geteuid() != 0:
+        return place.uid
+    if len(strangers) > 1 or place.shared:
+        message = f"cannot write {shown(place.path)}: {place.borrowed}"
+        raise DoraSystemdError(message, "nothing is changed", ExitCode.NO_PERMISSION)
+    return strangers[0]
 
 
 def replace_file(path: str, before: bytes, after: bytes, owner: int) -> None:

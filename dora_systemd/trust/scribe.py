@@ -4,6 +4,7 @@ owned.py calls replace_text() for the caller. For another user, owned.py has a c
 user run the text of this file.
 """
 
+import contextlib
 import errno
 import os
 import stat
@@ -13,6 +14,8 @@ _NEW_MODE = 0o644
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _CHANGED = "it was changed meanwhile"
+_ACL = "system.posix_acl_access"
+"""The extended attribute that has the ACL of a file, see acl(5)."""
 HEAD = 8
 """Digits of the length before each text."""
 
@@ -26,11 +29,11 @@ def replace_text(path: str, before: bytes, after: bytes) -> None:
     parent = os.open(directory or "/", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     temporary = f".{name}.{os.urandom(4).hex()}"
     try:
-        mode, group = _checked(parent, name, before)
+        mode, group, acl = _checked(parent, name, before)
         fd = os.open(temporary, _NEW, 0o600, dir_fd=parent)
         try:
             with os.fdopen(fd, "wb") as file:
-                _give(fd, mode, group)
+                _give(fd, mode, group, acl)
                 file.write(after)
                 file.flush()
                 os.fsync(fd)
@@ -43,24 +46,37 @@ def replace_text(path: str, before: bytes, after: bytes) -> None:
         os.close(parent)
 
 
-def _give(fd: int, mode: int, group: int) -> None:
-    """Give a new file the mode and the group of the file that it replaces."""
+def _give(fd: int, mode: int, group: int, acl: bytes) -> None:
+    """Give a new file the mode, the group and the ACL of the file that it replaces."""
+    with contextlib.suppress(OSError):  # one that its directory has given it
+        os.removexattr(fd, _ACL)
     try:
         os.fchown(fd, -1, group)
-    except OSError:
+    except OSError as error:
+        if acl:
+            raise OSError(0, "its ACL cannot be kept without its group") from error
         # Its owner is not in that group. Another group gets no more than all users have.
         mode = mode & ~stat.S_IRWXG | (mode & stat.S_IRWXO) << 3
     os.fchmod(fd, mode)
+    if acl:
+        os.setxattr(fd, _ACL, acl)
 
 
-def _checked(parent: int, name: str, before: bytes) -> tuple[int, int]:
-    """The mode and the group of the file. Raises OSError if it is not as it was read."""
+def _acl_of(fd: int) -> bytes:
+    """The ACL of a file, b"" without one."""
+    with contextlib.suppress(OSError):
+        return os.getxattr(fd, _ACL)
+    return b""
+
+
+def _checked(parent: int, name: str, before: bytes) -> tuple[int, int, bytes]:
+    """The mode, the group and the ACL of the file. Raises OSError if it is not as it was read."""
     try:
         fd = os.open(name, _READ, dir_fd=parent)
     except FileNotFoundError:
         if before:
             raise
-        return _NEW_MODE, -1
+        return _NEW_MODE, -1, b""
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise OSError(0, "it is a symbolic link") from error
@@ -71,7 +87,9 @@ def _checked(parent: int, name: str, before: bytes) -> tuple[int, int]:
             raise OSError(0, "it is not a regular file")
         if file.read(len(before) + 1) != before:
             raise OSError(0, _CHANGED)
-        return stat.S_IMODE(status.st_mode), status.st_gid
+        if not status.st_mode & stat.S_IWUSR:
+            raise OSError(0, "it is read-only")
+        return stat.S_IMODE(status.st_mode), status.st_gid, _acl_of(fd)
 
 
 def main(path: str) -> None:

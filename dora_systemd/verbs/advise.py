@@ -29,7 +29,7 @@ from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.names import release_of, settings_path
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
-from dora_systemd.trust.owned import replace_file
+from dora_systemd.trust.owned import replace_file, writer_of
 from dora_systemd.values import INFINITY, as_list, as_mapping, shown
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
@@ -176,7 +176,7 @@ def apply(report: AdviceReport, project: Project | None) -> AdviceReport:
     place = beside.place if beside else project.files.place
     data = beside.data if beside else b""
     mark = b"\xef\xbb\xbf" if data.startswith(b"\xef\xbb\xbf") else b""
-    replace_file(str(path), data, mark + text.encode(), place.uid)
+    replace_file(str(path), data, mark + text.encode(), writer_of(place))
     return replace(report, is_applied=True)
 
 

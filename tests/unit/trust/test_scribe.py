@@ -1,6 +1,8 @@
 """A file is replaced in one step, with the permissions of its owner, if it is as it was read."""
 
 import os
+import stat
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -8,12 +10,14 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.owned import replace_file
+from dora_systemd.trust.owned import replace_file, writer_of
+from dora_systemd.trust.paths import Place
 from dora_systemd.trust.scribe import replace_text
 from tests.unit.trust.test_sight import OTHER, can_run_python
 
 OWN = os.geteuid()
 FOREIGN_GROUP = 54321
+ACL = "system.posix_acl_access"
 
 
 @pytest.fixture(params=["own", "other"])
@@ -103,6 +107,55 @@ def test_root_lends_no_permission() -> None:
         with pytest.raises(DoraSystemdError, match="Permission denied"):
             replace_file(f"{name}/new", b"", b"x", OTHER.uid)
         assert [one.name for one in Path(name).iterdir()] == ["settings"]
+
+
+def test_a_file_that_is_read_only_stays(place: Path, owner: int) -> None:
+    path = make(place / "a", b"old", owner, 0o444)
+    with pytest.raises(DoraSystemdError, match="it is read-only"):
+        replace_file(str(path), b"old", b"new", owner)
+    assert path.read_bytes() == b"old"
+
+
+def test_an_acl_is_kept(place: Path, owner: int) -> None:
+    path = make(place / "a", b"old", owner)
+    entries = ((1, 6, -1), (2, 4, OTHER.uid), (4, 4, -1), (16, 4, -1), (32, 0, -1))
+    acl = struct.pack("<I", 2) + b"".join(struct.pack("<HHi", *one) for one in entries)
+    try:
+        os.setxattr(path, ACL, acl)
+    except OSError:
+        pytest.skip("this file system has no ACLs")
+    replace_file(str(path), b"old", b"new", owner)
+    assert path.read_bytes() == b"new"
+    assert os.getxattr(path, ACL) == acl
+
+
+def test_no_acl_comes_from_the_directory(place: Path, owner: int) -> None:
+    path = make(place / "a", b"old", owner, 0o644)
+    entries = ((1, 7, -1), (2, 6, OTHER.uid), (4, 5, -1), (16, 7, -1), (32, 5, -1))
+    acl = struct.pack("<I", 2) + b"".join(struct.pack("<HHi", *one) for one in entries)
+    try:
+        os.setxattr(place, "system.posix_acl_default", acl)
+    except OSError:
+        pytest.skip("this file system has no ACLs")
+    replace_file(str(path), b"old", b"new", owner)
+    assert (path.read_bytes(), ACL in os.listxattr(path)) == (b"new", False)
+
+
+def owned_by(*owners: int, shared: str = "") -> Place:
+    """The place of a file of root below directories of these users."""
+    return Place("/a", 0, stat.S_IFREG | 0o644, frozenset({0, *owners}), shared)
+
+
+@pytest.mark.skipif(OWN != 0, reason="only root becomes another user")
+def test_who_writes_a_file_of_root_in_the_directory_of_a_user() -> None:
+    """That user could make the directory a link while root writes."""
+    assert writer_of(owned_by()) == 0
+    assert writer_of(owned_by(1000)) == 1000
+    assert writer_of(owned_by(1000)._replace(uid=1001)) == 1001
+    for place in (owned_by(1000, 1001), owned_by(shared="/srv"), owned_by(1000, shared="/srv")):
+        with pytest.raises(DoraSystemdError) as caught:
+            writer_of(place)
+        assert caught.value.code is ExitCode.NO_PERMISSION
 
 
 def test_a_full_disk_leaves_the_old_file() -> None:
