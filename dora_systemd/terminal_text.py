@@ -24,6 +24,22 @@ COLOR_BYTES = _COLORS.encode()
 """Sequences that set colours, in bytes."""
 _RESET = "\x1b[0m"
 
+_LINE = r"\r|\x1b\[[0-2]?K"
+"""What a progress bar sends: back to the begin of the line, and erase it."""
+# Of a program that uses the whole screen. No mode or request makes the terminal type something, but
+# for the mouse, whose modes end with the program.
+_SCREEN = (
+    r"[\b\x07]|\x1b[78=>M]|\x1b\([0B]|\x1b\[[0-9;]*[@A-HJ-MPSTXdfr]|\x1b\[[su]"
+    r"|\x1b\[\?(?:1|7|12|25|47|100[02356]|1015|104[789]|2004|2026)[hl]"
+)
+_MODE = r"\x1b\[\?(\d+)([hl])"
+_CURSOR = "25"
+_UNFINISHED = (
+    rb"(?:\x1b(?:\(|\[[0-?]{0,60}[ -/]{0,4})?"
+    rb"|[\xc2-\xdf]|[\xe0-\xef][\x80-\xbf]?|[\xf0-\xf4][\x80-\xbf]{0,2})\Z"
+)
+"""The begin of a sequence, or of a character of several bytes, at the end of what was read."""
+
 
 def escaped(text: str) -> str:
     r"""`text` as a terminal may be given it: what would command it is shown, as in \x1b."""
@@ -77,6 +93,48 @@ def shown_log(data: bytes) -> bytes:
     if not re.search(_COMMANDS, text):
         return text.encode()
     return "\n".join(_shown_line(line.rstrip("\r")) for line in text.split("\n")).encode()
+
+
+class Display:
+    """What a program of another user prints, part by part, as a terminal may be given it.
+
+    Colours and progress bars pass, and once `is_full` is set, what programs for the whole screen
+    send. Everything else that a terminal would interpret is escaped.
+    """
+
+    def __init__(self) -> None:
+        self.is_full = False
+        self._rest = b""
+        self._modes = {_CURSOR}  # those that are on
+        self._color = ""  # the last sequence that has set one
+
+    def show(self, data: bytes) -> bytes:
+        """Return what to print of the next part; an unfinished end waits for the one after it."""
+        data = self._rest + data
+        cut = re.search(_UNFINISHED, data)
+        end = cut.start() if cut else len(data)
+        self._rest = data[end:]
+        return self._shown(data[:end])
+
+    def end(self) -> bytes:
+        """Return what to print after the program: the rest, and the end of what it has switched."""
+        rest, self._rest = self._shown(self._rest), b""
+        modes = "".join(f"\x1b[?{one}l" for one in sorted(self._modes - {_CURSOR}))
+        cursor = "" if _CURSOR in self._modes else f"\x1b[?{_CURSOR}h"
+        color = "" if self._color in ("", "\x1b[m", _RESET) else _RESET
+        return rest + f"{color}{modes}{cursor}".encode()
+
+    def _shown(self, data: bytes) -> bytes:
+        text = data.decode("utf-8", "backslashreplace")
+        allowed = "|".join((_COLORS, _LINE, *([_SCREEN] if self.is_full else [])))
+        passed = re.findall(allowed, text)
+        for one in passed:
+            if mode := re.fullmatch(_MODE, one):
+                (self._modes.add if mode[2] == "h" else self._modes.discard)(mode[1])
+            elif re.fullmatch(_COLORS, one):
+                self._color = one
+        shown = zip(re.split(allowed, text), [*passed, ""], strict=True)
+        return "".join(escaped(between) + one for between, one in shown).encode()
 
 
 def _shown_line(line: str) -> str:

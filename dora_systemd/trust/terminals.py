@@ -2,7 +2,8 @@
 
 A process with a terminal open can insert input into it, TIOCSTI in ioctl_tty(2), which root's shell
 would run. It could also keep reading from it after root believes that the program has ended. So the
-program gets its own session and pseudoterminal, and run_apart() copies between the two.
+program gets its own session and pseudoterminal, and run_apart() copies between the two. What the
+program prints is escaped on the way, see Display: it cannot make root's terminal type something.
 """
 
 import contextlib
@@ -18,12 +19,15 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from dora_systemd.errors import ExitCode
+from dora_systemd.terminal_text import Display
 from dora_systemd.trust.programs import Account, become
 
 _CHUNK = 65536
 _MOST_LATE = 64
 """Chunks to show after the program has ended: its children may keep writing."""
 _STREAMS = range(3)
+_MODES = 3
+"""The place of the local modes in what tcgetattr() returns, see termios(3)."""
 _BY_SIGNAL = 128
 
 
@@ -120,29 +124,48 @@ def _copy_size(screen: int | None, ours: int) -> None:
 
 def _carry(child: int, ours: int, screen: int | None, wake: int) -> None:
     """Copy input and output until the program has ended."""
-    end = os.pidfd_open(child)
+    end, display = os.pidfd_open(child), Display()
     sources = [end, ours, wake, *([0] if os.isatty(0) else [])]
     try:
         while end not in (ready := select.select(sources, [], [])[0]):
             if wake in ready:
                 os.read(wake, _CHUNK)
-            if ours in ready and not _copy(ours, screen):
+            if ours in ready and not _show(ours, screen, display):
                 sources.remove(ours)
             if 0 in ready and not _copy(0, ours):
                 sources.remove(0)
         for _ in range(_MOST_LATE):
-            if not (select.select([ours], [], [], 0)[0] and _copy(ours, screen)):
+            if not (select.select([ours], [], [], 0)[0] and _show(ours, screen, display)):
                 return
     finally:
         os.close(end)
+        _write(screen, display.end())
 
 
-def _copy(source: int, target: int | None) -> bool:
+def _copy(source: int, target: int) -> bool:
     """Copy one chunk; False at the end, which a pseudoterminal reports as an error."""
+    data = _read(source)
+    return bool(data) and _write(target, data)
+
+
+def _show(ours: int, screen: int | None, display: Display) -> bool:
+    """Copy one chunk for a terminal; False at the end."""
+    data = _read(ours)
+    # A program without line input uses the whole screen. It may end that before we read the rest.
+    display.is_full |= bool(data) and not termios.tcgetattr(ours)[_MODES] & termios.ICANON
+    return bool(data) and _write(screen, display.show(data))
+
+
+def _read(source: int) -> bytes:
+    with contextlib.suppress(OSError):
+        return os.read(source, _CHUNK)
+    return b""
+
+
+def _write(target: int | None, data: bytes) -> bool:
     try:
-        data = left = os.read(source, _CHUNK)
-        while left and target is not None:
-            left = left[os.write(target, left) :]
+        while data and target is not None:
+            data = data[os.write(target, data) :]
     except OSError:
         return False
-    return bool(data)
+    return True

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dora_systemd.cli import edge
 from dora_systemd.cli.edge import Edge, write_own
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
-from dora_systemd.terminal_text import escaped, one_line, shown_log, without_sequences
+from dora_systemd.terminal_text import Display, escaped, one_line, shown_log, without_sequences
 from tests.unit.checkout import linked_package
 
 COMMANDING = {*range(0x20), *range(0x7F, 0xA0), 0x202E, 0x2066, 0x200F} - {9, 10}
@@ -134,3 +134,35 @@ def test_the_command_writes_through_it(tmp_path: Path) -> None:
     assert done.returncode
     assert b"\x1b" not in done.stdout + done.stderr
     assert "\u202e".encode() not in done.stdout + done.stderr
+
+
+FULL = "\x1b[?1049h\x1b[?1000h\x1b[?25l\x1b[2;3Hx\x1b[K"
+QUERIES = ("\x1b[c", "\x1b[6n", "\x1b[21t", "\x1b[>q", "\x1b[?u", "\x1bP$qm\x1b\\", "\x05", "\x1bZ")
+
+
+@pytest.mark.parametrize("is_full", [True, False])
+@pytest.mark.parametrize("size", [1, 3, 1000])
+def test_a_program_of_others_cannot_make_the_terminal_type(is_full: bool, size: int) -> None:
+    orders = "a\x1b]52;c;cm0=\x07\x1b]0;t\x07\u202e\x9bc"
+    display, sent = Display(), orders.join(QUERIES).encode()
+    display.is_full = is_full
+    parts = [display.show(sent[n : n + size]) for n in range(0, len(sent), size)]
+    shown = (b"".join(parts) + display.end()).decode()
+    assert "\x1b" not in shown
+    assert not any(one in shown for one in ("\x05", "\u202e", "\x9b"))
+    assert "\\x1b]52;c;cm0=" in shown
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 1000])
+def test_what_a_program_for_the_whole_screen_sends(size: int) -> None:
+    sent = f"ä\U0001f916\x1b[1;31mred\r{FULL}\r\n".encode()
+    for is_full in (True, False):
+        display = Display()
+        display.is_full = is_full
+        shown = b"".join(display.show(sent[n : n + size]) for n in range(0, len(sent), size))
+        assert shown.startswith("ä\U0001f916\x1b[1;31mred\r".encode())
+        assert (shown == sent) == is_full
+    assert display.end() == b"\x1b[0m"
+    display.is_full = True
+    display.show(FULL.encode())
+    assert display.end() == b"\x1b[0m\x1b[?1000l\x1b[?1049l\x1b[?25h", "what is left on"
