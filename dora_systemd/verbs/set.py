@@ -5,7 +5,7 @@ in a drop-in of ours next to systemd's. Drop-ins of a transient unit disappear w
 of a unit file when the file is removed.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -48,11 +48,13 @@ def set_limits(
     flags: Mapping[str, object],
     is_forced: bool = False,
     ask: Ask = order,
+    first: Callable[[], object] = bool,
 ) -> tuple[str, ...]:
     """Change limits of a dataflow, or of its next start if it does not run; return warnings.
 
     flags: raw values by name of CHANGEABLE. is_forced: also limits below the current
-    usage. `ask`: sends a request to the runner. Raises DoraSystemdError; then nothing is changed.
+    usage. `ask`: sends a request to the runner. first: is called after all checks; what it raises
+    prevents the change. Raises DoraSystemdError; then nothing is changed.
     """
     settings = resolve_settings(flags, {}, (), CHANGEABLE)
     properties, nodes, rates = settings_properties(settings), _limits(settings), _rates(settings)
@@ -71,6 +73,7 @@ def set_limits(
     values = {key: settings.values[key] for key in BY_KEY}
     warnings = (*size_warnings(values, nodes, read_machine()), *_placed_warnings(cell, rates))
     _check_usage(unit, values, nodes, is_forced)
+    first()
     # systemd stores drop-ins of a transient unit in /run in any case.
     is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
     # The kernel is the most likely to refuse, then systemd. `undo` reverts the steps before that.

@@ -80,12 +80,21 @@ def _changes(
     force: bool,
 ) -> Iterator[str]:
     """Make each change, then yield it."""
+    warnings: list[str] = []
+
+    def switch() -> None:
+        if record is not None:
+            warnings.extend(switch_record(bus, scope, cell, record))
+
     if (hot_reload is None and record is None) or any(map(is_given, flags.values())):
-        print_warnings(set_limits(bus, scope, cell, flags, force))
+        # The runner may refuse what is to be recorded: then the limits stay, too.
+        print_warnings(set_limits(bus, scope, cell, flags, force, first=switch))
         yield "Limits changed" if cell.has_begun else "Limits changed for the next start"
+    else:
+        switch()
     if hot_reload is not None:
         switch_hot_reload(bus, scope, cell, hot_reload == "on")
         yield f"Hot reload {hot_reload}"
     if record is not None:
-        print_warnings(switch_record(bus, scope, cell, record))
+        print_warnings(warnings)
         yield "Recorder changed"
