@@ -6,6 +6,7 @@ pattern can take for ever, so that is done where it can be killed, and never as 
 project.py has a child process of that account run the text of this file. Requests are lines of
 JSON. An answer is frames: a letter, a length as 7 digits, and that many bytes; "+" has data, "."
 ends an answer, "-" ends it with the reason of a failure. All paths are relative to the project.
+An answer that is not the content of a file has lines of JSON, so that parts of it can be checked.
 """
 
 import contextlib
@@ -16,7 +17,7 @@ import stat
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -191,20 +192,20 @@ def repository(owners: list[int]) -> str:
     return ""
 
 
-def tracked(owners: list[int], most: int) -> dict[str, Any]:
-    """The files that git would track, None without git, and the revision.
+def tracked(owners: list[int], most: int) -> list[str]:
+    """The revision, "" without one, and the files that git would track; [] without git.
 
     Without owners git is not called.
     """
     if not owners:
-        return {"files": None, "revision": ""}
+        return []
     safe = repository(owners)
     names = git(("ls-files", "-z", "--cached", "--others", "--exclude-standard"), safe)
     if not names:  # nor if a git above ignores all of it
-        return {"files": None, "revision": ""}
+        return []
     about = git(("describe", "--always", "--abbrev=7", "--dirty=+", "--exclude=*"), safe)
     files = [os.fsdecode(one) for one in names.split(b"\0") if one]
-    return {"files": sorted({*files})[:most], "revision": os.fsdecode(about or b"").strip()}
+    return [os.fsdecode(about or b"").strip(), *sorted({*files})[:most]]
 
 
 @cache
@@ -219,15 +220,21 @@ def answer(request: dict[str, Any]) -> Iterator[bytes]:
     if what == "read":
         yield from content(request["path"])
     elif what == "list":
-        yield json.dumps(listed(request["path"], request["most"])).encode()
+        yield from lines(listed(request["path"], request["most"]))
     elif what == "walk":
         rules = rules_of(request["libraries"], *request["always"])
         rules.enter(request["path"])
-        yield json.dumps(listed(request["path"], request["most"], rules)).encode()
+        yield from lines(listed(request["path"], request["most"], rules))
     elif what == "facts":
-        yield json.dumps([facts(one, request["opens"]) for one in request["paths"]]).encode()
+        yield from lines([facts(one, request["opens"]) for one in request["paths"]])
     elif what == "git":
-        yield json.dumps(tracked(request["owners"], request["most"])).encode()
+        yield from lines(tracked(request["owners"], request["most"]))
+
+
+def lines(values: Sequence[Any]) -> Iterator[bytes]:
+    """The values, a line of JSON for each."""
+    if values:
+        yield b"".join(json.dumps(one).encode() + b"\n" for one in values)
 
 
 def frame(letter: bytes, data: bytes = b"") -> None:

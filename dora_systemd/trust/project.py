@@ -35,6 +35,8 @@ _SECONDS_PER_FILE = 0.05
 _HEAD = 8
 MOST_ANSWER = 64 * 1024 * 1024
 """Maximum bytes of an answer that is not the content of a file."""
+_LONGEST_LINE = 256 * 1024
+"""Maximum bytes of a line of an answer: JSON of many small values takes 20 times its size."""
 _BATCH = 500
 _MOST_SIZE = 2**63
 _SHORT = 500
@@ -94,8 +96,9 @@ class Project:
 
     def _entries(self, request: dict[str, Any]) -> list[list[Any]]:
         directory, most = request["path"], request["most"]
-        rows = self._rows(self._value(request, directory), directory)
-        if len(rows) > most or any(posixpath.dirname(row[0]) != directory for row in rows):
+        values = self._values(request, directory, most)
+        rows = [self._row(value, directory) for value in values]
+        if any(posixpath.dirname(row[0]) != directory for row in rows):
             raise self._broken(directory)
         return rows
 
@@ -104,12 +107,12 @@ class Project:
         found: list[list[Any] | None] = []
         for start in range(0, len(paths), _BATCH):
             part = paths[start : start + _BATCH]
-            rows = self._value({"ask": "facts", "paths": list(part), "opens": opens}, part[0])
-            if not isinstance(rows, list) or len(rows) != len(part):
+            asked = {"ask": "facts", "paths": list(part), "opens": opens}
+            values = self._values(asked, part[0], len(part))
+            rows = [None if one is None else self._row(one, part[0]) for one in values]
+            if len(rows) != len(part):
                 raise self._broken(part[0])
-            asked = [(one, row) for one, row in zip(part, rows, strict=True) if row is not None]
-            there = self._rows([row for _, row in asked], part[0])
-            if any(one != row[0] for (one, _), row in zip(asked, there, strict=True)):
+            if any(row and row[0] != one for one, row in zip(part, rows, strict=True)):
                 raise self._broken(part[0])
             found += rows
         return found
@@ -123,42 +126,42 @@ class Project:
 
         owners: of a repository that git may read although the account does not own it.
         """
-        value = self._value({"ask": "git", "owners": list(owners), "most": most}, ".git")
-        files = value.get("files") if isinstance(value, dict) else None
-        if files is None:
-            return None, ""
-        if not isinstance(files, list) or len(files) > most or not all(map(_is_text, files)):
-            raise self._broken(".git")
-        return files, str(value.get("revision", ""))
+        asked = {"ask": "git", "owners": list(owners), "most": most}
+        texts = list(map(self._text, self._values(asked, ".git", most + 1)))
+        return (texts[1:], texts[0]) if texts else (None, "")
 
-    def _rows(self, rows: Any, path: str) -> list[list[Any]]:
+    def _text(self, value: Any) -> str:
+        if not _is_text(value):
+            raise self._broken(".git")
+        return str(value)
+
+    def _row(self, row: Any, path: str) -> list[Any]:
         types = (str, str, int, bool, str, str, int)
-        is_sound = isinstance(rows, list) and all(
+        is_sound = (
             isinstance(row, list)
             and len(row) == len(types)
             and all(type(one) is kind for one, kind in zip(row, types, strict=True))
             and 0 <= row[2] < _MOST_SIZE
             and all(_is_text(one) for one in row if isinstance(one, str))
-            for row in rows
         )
         if not is_sound:
             raise self._broken(path)
-        return list(rows)
+        return list(row)
 
-    def _value(self, request: dict[str, Any], path: str) -> Any:
-        try:
-            return json.loads(self._whole(request, path))
-        except (ValueError, RecursionError) as error:
-            raise self._broken(path) from error
-
-    def _whole(self, request: dict[str, Any], path: str) -> bytes:
-        parts, size = [], 0
+    def _values(self, request: dict[str, Any], path: str, most: int) -> Iterator[Any]:
+        """The values in the lines of an answer, one by one, so that no more is in memory."""
+        rest, size, count = b"", 0, 0
         for part in self._ask(request, path):
-            size += len(part)
-            if size > MOST_ANSWER:
+            *lines, rest = (rest + part).split(b"\n")
+            size, count = size + len(part), count + len(lines)
+            if size > MOST_ANSWER or count > most or len(rest) > _LONGEST_LINE:
                 raise self._broken(path)
-            parts.append(part)
-        return b"".join(parts)
+            try:
+                yield from map(json.loads, lines)
+            except (ValueError, RecursionError) as error:
+                raise self._broken(path) from error
+        if rest:
+            raise self._broken(path)
 
     def _ask(self, request: dict[str, Any], path: str) -> Iterator[bytes]:
         assert self._child.stdin

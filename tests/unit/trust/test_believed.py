@@ -79,7 +79,7 @@ def test_only_a_file_that_was_asked_for_is_named(tmp_path: Path) -> None:
     assert caught.value.message == f"cannot read {tmp_path}/b as user {ME}: no"
 
 
-GOOD = "answer([['a', 'file', 1, False, '', 's', 1], None])"
+GOOD = "answer(*[['a', 'file', 1, False, '', 's', 1], None])"
 
 
 @pytest.mark.parametrize(
@@ -87,18 +87,19 @@ GOOD = "answer([['a', 'file', 1, False, '', 's', 1], None])"
     [
         "answer({})",
         "answer([])",
-        "answer([None])",
-        "answer([None, None, None])",
-        "answer([['b', 'file', 1, False, '', 's', 1], None])",
-        "answer([['a', 'file', 1, False, '', 's'], None])",
-        "answer([['a', 'file', 1, False, '', 's', 's'], None])",
-        "answer([['a', 'file', '1', False, '', 's', 1], None])",
-        "answer([['a', 'file', 1, 0, '', 's', 1], None])",
-        "answer([['a', 'file', 1, False, '', None, 1], None])",
-        "answer([['a', 'file', -1, False, '', 's', 1], None])",
-        "answer([['a', 'file', 2**63, False, '', 's', 1], None])",
-        "answer([['a', 'file', 1, False, 't' * 4097, 's', 1], None])",
-        "answer(['afile1', None])",
+        "answer(None)",
+        "answer(None, None, None)",
+        "answer(False, None)",
+        "answer(*[['b', 'file', 1, False, '', 's', 1], None])",
+        "answer(*[['a', 'file', 1, False, '', 's'], None])",
+        "answer(*[['a', 'file', 1, False, '', 's', 's'], None])",
+        "answer(*[['a', 'file', '1', False, '', 's', 1], None])",
+        "answer(*[['a', 'file', 1, 0, '', 's', 1], None])",
+        "answer(*[['a', 'file', 1, False, '', None, 1], None])",
+        "answer(*[['a', 'file', -1, False, '', 's', 1], None])",
+        "answer(*[['a', 'file', 2**63, False, '', 's', 1], None])",
+        "answer(*[['a', 'file', 1, False, 't' * 4097, 's', 1], None])",
+        "answer('afile1', None)",
     ],
 )
 def test_facts_that_are_none(tmp_path: Path, lie: str) -> None:
@@ -110,7 +111,7 @@ def test_facts_that_are_none(tmp_path: Path, lie: str) -> None:
 
 
 def test_the_largest_facts_that_are_believed(tmp_path: Path) -> None:
-    largest = f"answer([['a', 'file', 2**63 - 1, False, '{'t' * 4096}', 's', 1], None])"
+    largest = f"answer(*[['a', 'file', 2**63 - 1, False, '{'t' * 4096}', 's', 1], None])"
     for text in (GOOD, largest, GOOD.replace("1,", "0,")):
         with opened_liar(tmp_path, text) as project:
             found, missing = project.facts(["a", "b"])
@@ -130,11 +131,11 @@ def test_many_files_are_asked_for_in_parts(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "lie",
     [
-        "answer({'files': 'abc', 'revision': ''})",
-        "answer({'files': {}, 'revision': ''})",
-        "answer({'files': ['a', 1], 'revision': ''})",
-        "answer({'files': ['a' * 4097], 'revision': ''})",
-        "answer({'files': ['a'] * 4, 'revision': ''})",
+        "answer('r', 'a', 1)",
+        "answer(7, 'a')",
+        "answer(['r', 'a'])",
+        "answer('r', 'a' * 4097)",
+        "answer('r', *['a'] * 4)",
     ],
 )
 def test_files_of_git_that_are_none(tmp_path: Path, lie: str) -> None:
@@ -148,11 +149,9 @@ def test_files_of_git_that_are_none(tmp_path: Path, lie: str) -> None:
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("answer({'files': ['a'] * 3, 'revision': 7})", (["a"] * 3, "7")),
-        ("answer({'files': ['a']})", (["a"], "")),
-        ("answer({'files': []})", ([], "")),
-        ("answer({'files': None, 'revision': 'x'})", (None, "")),
-        ("answer([])", (None, "")),
+        ("answer('7', *['a'] * 3)", (["a"] * 3, "7")),
+        ("answer('')", ([], "")),
+        ("sys.stdout.write('.0000000')", (None, "")),
     ],
 )
 def test_what_git_says(tmp_path: Path, text: str, found: tuple[list[str] | None, str]) -> None:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import time
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -91,7 +92,7 @@ def test_a_git_above_that_ignores_all_of_it(root: Path) -> None:
 
 def row(path: str = "a", size: int | str = 1) -> str:
     """Code that answers with a row."""
-    return f"answer([[{path!r}, 'file', {size}, False, '', 's', 1]])"
+    return f"answer([{path!r}, 'file', {size}, False, '', 's', 1])"
 
 
 LIARS = {
@@ -99,14 +100,16 @@ LIARS = {
     "no number": row(size="True"),
     "long": row(path="a" * 5000),
     "elsewhere": row(path="b/a"),
-    "too many": "answer([[str(n), 'file', 1, False, '', 's'] for n in range(11)])",
+    "too many": "answer(*[[str(n), 'file', 1, False, '', 's', 1] for n in range(11)])",
     "silent": "",
     "no frame": "sys.stdout.write('hello, world')",
     "too long": "sys.stdout.write('+9999999')",
-    "no JSON": "sys.stdout.write('+0000001x.0000000')",
-    "other JSON": "sys.stdout.write('+0000004null.0000000')",
-    "other rows": "sys.stdout.write('+0000013[[1,2,3,4,5]].0000000')",
-    "negative": """sys.stdout.write('+0000033[["a","file",-1,false,"","s"]]   .0000000')""",
+    "no JSON": r"sys.stdout.write('+0000002x\n.0000000')",
+    "other JSON": r"sys.stdout.write('+0000005null\n.0000000')",
+    "other rows": "answer([1, 2, 3, 4, 5])",
+    "negative": row(size=-1),
+    "no line": "sys.stdout.write('+0000001x.0000000')",
+    "deep": "answer(eval('[' * 90 + ']' * 90))",
     "empty frames": "[sys.stdout.write('+0000000') for _ in range(5000)]",
     "endless": "while True: sys.stdout.write('+0262144' + ' ' * 262144)",
 }
@@ -114,8 +117,8 @@ LIARS = {
 
 _ANSWER = """
 import json, sys
-def answer(value):
-    text = json.dumps(value)
+def answer(*values):
+    text = "".join(json.dumps(one) + "\\n" for one in values)
     sys.stdout.write(f"+{len(text):07d}{text}.0000000")
 sys.stdin.readline()
 """
@@ -137,6 +140,23 @@ def test_a_child_that_lies(lie: str, tmp_path: Path) -> None:
         pytest.raises(DoraSystemdError, match="no answer"),
     ):
         project.listed("", 10)
+
+
+@pytest.mark.parametrize("part", ["[],", "0,", '"ab",', "[]!"])
+def test_a_child_that_lies_takes_no_memory(part: str, tmp_path: Path) -> None:
+    """As JSON all of its 64 MiB would be more than 1 GB here."""
+    text = (
+        f"for _ in range(250): sys.stdout.write('+0262140' + '{part}' * (262140 // len('{part}')))"
+    )
+    tracemalloc.start()
+    try:
+        with opened_liar(tmp_path, text) as project:
+            for use in (lambda: project.listed("", 9), lambda: project.tracked([1], 9)):
+                with pytest.raises(DoraSystemdError, match="no answer"):
+                    use()
+        assert tracemalloc.get_traced_memory()[1] < 20 * 1024 * 1024
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_child_that_stops(project: Project) -> None:
