@@ -94,7 +94,7 @@ class _Sample:
         self._waited, self._proc = waited, proc
         group = f"/{next(iter(groups.values())).relative_to(cgroup.mount_point())}"
         self._place = _unit_place(group).above
-        self._pids = {node: frozenset(cgroup.pids(path)) for node, path in groups.items()}
+        self._pids = {node: frozenset(cgroup.some_pids(path)) for node, path in groups.items()}
         delays, before, began = self._delays(), read_times(proc), time.monotonic()
         sleep(_SAMPLE_SECONDS)
         self._span = max(time.monotonic() - began, 1 / TICKS)

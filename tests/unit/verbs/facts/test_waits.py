@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.adapters.cgroup.groups import MAX_GROUPS
 from dora_systemd.adapters.host.rivals import Interrupts
 from dora_systemd.decisions.resources.rivals import Rival
 from dora_systemd.decisions.why.waits import MINUTE, CpuWait
@@ -87,6 +88,21 @@ def test_a_busy_process_is_named(scope: Scope, write: Write, proc: Path) -> None
     (rival,) = one.rivals
     assert rival._replace(cpu_percent=0) == Rival(12, "burn", 0, "n of b"), "not its own process"
     assert 20 < rival.cpu_percent <= 110
+
+
+def test_not_all_groups_that_a_node_makes_are_read(
+    scope: Scope, write: Write, proc: Path, tmp_path: Path
+) -> None:
+    """A hundred thousand take `why` and the status page seconds."""
+    write("cpu.pressure", PSI.format("31.25"))
+    write("cgroup.procs", "11\n")
+    (node,) = tmp_path.rglob("node-camera")
+    for number in range(MAX_GROUPS):
+        deep = node / f"{number}/deep"
+        deep.mkdir(parents=True)
+        (deep / "cgroup.procs").write_text("12\n")
+    (one,) = waits(scope, proc)
+    assert [rival.pid for rival in one.rivals] == [12]
 
 
 @pytest.mark.parametrize(
