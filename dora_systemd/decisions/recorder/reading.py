@@ -53,10 +53,11 @@ class Recorded(NamedTuple):
 class Reading:
     """A ring, read once from its oldest message to its last. Raises ValueError for no ring.
 
-    size: bytes of the file. most: bytes of messages that are read.
+    size: bytes of the file. most: bytes of messages that are read. records: number of them, and
+    as many more to find the last ones of outputs.
     """
 
-    def __init__(self, source: Source, size: int, most: int) -> None:
+    def __init__(self, source: Source, size: int, most: int, records: int = MOST_RECORDS) -> None:
         self._source = source
         self.header: Header = parse_header(source.read(0, ALIGN))
         if size != size_of(self.header):
@@ -66,6 +67,7 @@ class Reading:
         if windows > self.header.budget:
             raise ValueError("it has more than its budget")
         self._most, self._skipped = most, max(windows - most, 0)
+        self._records, self._left = records, 2 * records
         self.damaged = 0
         """Messages that could not be read, at least."""
         self.is_cut = False
@@ -90,7 +92,7 @@ class Reading:
         tapes = (self._walk(at, state) for at, state in enumerate(self.states))
         for output, head, position, crc in heapq.merge(*tapes, key=lambda one: one[1].number):
             count += 1
-            if count > MOST_RECORDS:
+            if count > self._records:
                 self.is_cut = True
                 break
             if self._skipped > 0:
@@ -117,10 +119,14 @@ class Reading:
 
     def newest(self, at: int, most: int = MOST_RECORDS) -> Recorded | None:
         """The last message of one output; None for none, and if it has more than `most`."""
+        before = None
         for _ in range(_TRIES):
-            last = deque(enumerate(islice(self._walk(at, self._state(at)[0]), most + 1)), maxlen=1)
+            if (state := self._state(at)[0]) == before:
+                return None  # it is damaged, and not given up meanwhile
+            before = state
+            last = deque(enumerate(islice(self._walk(at, state), most + 1)), maxlen=1)
             for count, (output, head, position, crc) in last:
-                if head.size > self._most or count == most:
+                if head.size > self._most or count == most or self._left <= 0:
                     return None
                 if message := self._message(output, head, position, crc):
                     return message
@@ -132,7 +138,8 @@ class Reading:
         if end - position > self.header.budget:
             self.damaged += 1
             return
-        while position < end:
+        while position < end and self._left > 0:
+            self._left -= 1
             data = read_tape(self._source, self.header, at, position, RECORD_SIZE)
             try:
                 head, crc = parse_record(data, end - position)

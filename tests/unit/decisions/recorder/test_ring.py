@@ -230,6 +230,32 @@ def test_a_damaged_message_is_counted() -> None:
     assert (len(messages), reading.damaged) == (2, 1)
 
 
+class Counting(MemoryStore):
+    """Counts the reads."""
+
+    reads = 0
+
+    def read(self, at: int, size: int) -> bytes:
+        self.reads += 1
+        return super().read(at, size)
+
+
+@pytest.mark.parametrize(("records", "most"), [(1000, 400), (20, 120)])
+def test_damaged_messages_are_not_read_again_and_again(records: int, most: int) -> None:
+    """The user of the nodes can write millions of them."""
+    store, _ = ring(budget=64 * PAGE)
+    one = writer(store)
+    for _ in range(60):
+        one.put(0, message(b"x"))
+    for data in store.pages.values():
+        data[:] = data.replace(b"x", b"y")
+    store.__class__ = Counting
+    assert isinstance(store, Counting)
+    reading = Reading(store, store.size, 1 << 20, records)
+    assert [*reading.messages()] == []
+    assert store.reads < most
+
+
 def test_of_a_large_message_both_ends_are_checked() -> None:
     for place, is_damaged in ((1000, True), (SMALL, False), (2 * SMALL - 1000, True)):
         store, header = ring(budget=64 * PAGE)
