@@ -52,6 +52,13 @@ def _record(opcode: int, *parts: bytes) -> bytes:
     return RECORD.pack(opcode, len(content)) + content
 
 
+def _crc_of(parts: Iterable[bytes]) -> int:
+    crc = 0
+    for one in parts:
+        crc = zlib.crc32(one, crc)
+    return crc
+
+
 def _time(time_ns: int) -> int:
     return min(max(time_ns, 0), MAX_TIME)
 
@@ -148,16 +155,21 @@ class McapWriter:
     def _end_chunk(self) -> None:
         if not self._chunk:
             return
-        records, span = b"".join(self._chunk), self._chunk_times.pack()
-        sizes = struct.pack("<QI", len(records), zlib.crc32(records)), _text("")
-        start = self._put(_record(_CHUNK, span, *sizes, struct.pack("<Q", len(records)), records))
+        size, span = self._size, self._chunk_times.pack()
+        # A large message is not copied: it can have most of the bytes that a reader may use.
+        records = self._chunk if size > 2 * CHUNK_SIZE else [b"".join(self._chunk)]
+        sizes = struct.pack("<QI", size, _crc_of(records)), _text(""), struct.pack("<Q", size)
+        head = span + b"".join(sizes)
+        start = self._put(RECORD.pack(_CHUNK, len(head) + size) + head)
+        for one in records:
+            self._put(one)
         length, places = self._offset - start, dict[int, int]()
         for channel, entries in self._index.items():
             index = struct.pack("<HI", channel, sum(map(len, entries)))
             places[channel] = self._put(_record(MESSAGE_INDEX, index, *entries))
         index_length = self._offset - start - length
         place, indexes = SPAN.pack(start, length), _numbers("<Q", places)
-        ends = struct.pack("<Q", index_length), _text(""), SPAN.pack(len(records), len(records))
+        ends = struct.pack("<Q", index_length), _text(""), SPAN.pack(size, size)
         self._chunk_indexes.append(_record(CHUNK_INDEX, span, place, indexes, *ends))
         self._chunk, self._size, self._index, self._chunk_times = [], 0, {}, Times()
 

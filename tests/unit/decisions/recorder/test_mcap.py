@@ -1,6 +1,7 @@
 """The MCAP file that is made of a ring."""
 
 import io
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -132,3 +133,31 @@ def test_the_file_is_read_by_mcap_and_pyarrow(tmp_path: Any) -> None:
     damaged = data[:place] + b"[" + data[place + 1 :]
     with pytest.raises(stream.CRCValidationError):
         list(stream.StreamReader(io.BytesIO(damaged), validate_crcs=True).records)
+
+
+def test_a_large_message_is_written_without_a_copy() -> None:
+    """The user of the nodes can have one that takes all that a reader may read."""
+    data, sizes = bytes(16 << 20), list[int]()
+    tracemalloc.start()
+    try:
+        file = McapWriter(lambda part: sizes.append(len(part)), "x")
+        for number in range(2):
+            channel = file.channel("a/b", "arrow", b"schema")
+            assert channel is not None
+            file.message(channel, number, NOW, NOW, data)
+        file.finish()
+        assert tracemalloc.get_traced_memory()[1] < len(data) // 2
+    finally:
+        tracemalloc.stop()
+    assert 2 * len(data) < sum(sizes) < 2 * len(data) + 10_000
+
+
+def test_a_file_with_large_messages_is_whole() -> None:
+    out, datas = io.BytesIO(), [b"a" * 10, b"b" * (3 << 20), b"c" * 10]
+    file = McapWriter(out.write, "x")
+    for number, data in enumerate(datas):
+        channel = file.channel("a/b", "arrow", b"schema")
+        assert channel is not None
+        file.message(channel, number, NOW, NOW, data)
+    file.finish()
+    assert [one.data for one in File(out.getvalue()).messages] == datas
