@@ -57,9 +57,18 @@ class Step:
         return self.present == (self.file.link or self.text)
 
 
-def plan_setup(scope: Scope, root: Path | None = None) -> list[Step]:
-    """Every file with its current content. Raises DoraSystemdError for a foreign file."""
-    manuals = [path.name for path in _directory("man").iterdir()]
+def plan_setup(scope: Scope, root: Path | None = None, package: Path = _PACKAGE) -> list[Step]:
+    """Every file with its current content.
+
+    Raises DoraSystemdError for a foreign file, and for a doractl that a Debian package has
+    installed: that has the files elsewhere, and dpkg removes them.
+    """
+    source = _directory("man", package)
+    if not source.is_dir():
+        message = "cannot install or remove the files of a package"
+        hint = "apt remove dora-systemd; apt reinstall dora-systemd installs them again"
+        raise DoraSystemdError(message, hint)
+    manuals = [path.name for path in source.iterdir()]
     place = root or data_root(scope)
     return [_step(file, place / file.place) for file in setup_files(scope.is_user, manuals)]
 
@@ -165,7 +174,7 @@ def text_of(file: SetupFile) -> str:
     return with_interpreter(text, sys.executable)
 
 
-def _directory(kind: str) -> Path:
+def _directory(kind: str, package: Path = _PACKAGE) -> Path:
     """The directory of the files of one kind, in the installed package or in a checkout."""
-    in_checkout = _PACKAGE.parent / _CHECKOUT.get(kind, f"packaging/{kind}")
-    return _PACKAGE / kind if (_PACKAGE / kind).is_dir() else in_checkout
+    in_checkout = package.parent / _CHECKOUT.get(kind, f"packaging/{kind}")
+    return package / kind if (package / kind).is_dir() else in_checkout

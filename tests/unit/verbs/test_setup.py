@@ -90,6 +90,13 @@ def test_an_older_version_is_replaced(tmp_path: Path) -> None:
     assert "man:dora-systemd(7)" in path.read_text()
 
 
+def test_the_files_of_a_package_are_left_to_apt(tmp_path: Path) -> None:
+    """Its doractl has neither the manuals nor the completions beside itself."""
+    with pytest.raises(DoraSystemdError, match="the files of a package") as caught:
+        plan_setup(SYSTEM, tmp_path, tmp_path / "dist-packages/dora_systemd")
+    assert "apt remove" in caught.value.hint
+
+
 def test_what_is_in_use_stays(tmp_path: Path) -> None:
     manager = FakeManager()
     manager.etc = tmp_path
