@@ -32,7 +32,7 @@ from dora_systemd.decisions.unit.setup_files import (
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit
-from dora_systemd.scope import Scope
+from dora_systemd.scope import Scope, config_home
 from dora_systemd.verbs.facts.enabled import own_directories
 
 _PACKAGE = Path(__file__).parents[1]
@@ -121,9 +121,12 @@ def leave_no_state(scope: Scope) -> None:
         remove_empty(directory)
 
 
-def refuse_if_needed(manager: Manager, scope: Scope) -> None:
-    """Raise DoraSystemdError while dora.target starts dataflows at boot."""
-    links = own_directories(manager, scope)[0].glob(f"{BOOT_TARGET}.wants/*")
+def refuse_if_needed(reach: Callable[[Scope], Manager], scope: Scope) -> None:
+    """Raise DoraSystemdError while dora.target starts dataflows at boot.
+
+    reach: opens the connection. Without systemd the usual directory of unit files is read.
+    """
+    links = _boot_directory(reach, scope).glob(f"{BOOT_TARGET}.wants/*")
     names = sorted(filter(None, (name_from_unit(link.name) for link in links)))
     if names:
         raise DoraSystemdError(
@@ -131,6 +134,17 @@ def refuse_if_needed(manager: Manager, scope: Scope) -> None:
             f"doractl {scope.flag} disable {' '.join(names)}",
             ExitCode.USAGE,
         )
+
+
+def _boot_directory(reach: Callable[[Scope], Manager], scope: Scope) -> Path:
+    """The directory of the admin's (or user's) unit files."""
+    try:
+        return own_directories(reach(scope), scope)[0]
+    except DoraSystemdError as error:
+        if error.code is not ExitCode.NO_SYSTEMD:
+            raise
+    of_user = Path("/", config_home(os.environ), "systemd/user")
+    return of_user if scope.is_user else Path("/etc/systemd/system")
 
 
 def tell_systemd(reach: Callable[[Scope], Manager], scope: Scope) -> tuple[str, ...]:

@@ -10,8 +10,6 @@ from dora_systemd.cli.parameters import (
     print_warnings,
 )
 from dora_systemd.decisions.views.outcome import Outcome, Thing
-from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.scope import Scope
 from dora_systemd.verbs.setup import (
     leave_no_state,
     packaged_unit,
@@ -44,7 +42,7 @@ def command(want_removal: bool) -> int:
         return _nothing(f"Everything is installed by a package: {packaged}")
     steps = plan_setup(scope)
     if want_removal:
-        _check_use(scope)
+        refuse_if_needed(Bus, scope)
     changed = take_away(steps) if want_removal else put_in_place(steps)
     if not changed:
         return _nothing("Nothing to remove." if want_removal else "Everything is installed.")
@@ -60,12 +58,3 @@ def command(want_removal: bool) -> int:
 
 def _nothing(text: str) -> int:
     return print_outcomes([Outcome(Thing(), text, is_news=False)])
-
-
-def _check_use(scope: Scope) -> None:
-    """Refuse removal while a boot needs the files; without systemd nothing does."""
-    try:
-        refuse_if_needed(Bus(scope), scope)
-    except DoraSystemdError as error:
-        if error.code is not ExitCode.NO_SYSTEMD:
-            raise

@@ -97,18 +97,30 @@ def test_the_files_of_a_package_are_left_to_apt(tmp_path: Path) -> None:
     assert "apt remove" in caught.value.hint
 
 
+def reach_nothing(_scope: Scope) -> FakeManager:
+    raise DoraSystemdError("cannot reach systemd", "", ExitCode.NO_SYSTEMD)
+
+
 def test_what_is_in_use_stays(tmp_path: Path) -> None:
     manager = FakeManager()
     manager.etc = tmp_path
-    refuse_if_needed(manager, SYSTEM)
+    refuse_if_needed(lambda _scope: manager, SYSTEM)
     manager.enable_unit_files(["dora-robot.service"])
     with pytest.raises(DoraSystemdError, match="a boot starts robot") as caught:
-        refuse_if_needed(manager, SYSTEM)
+        refuse_if_needed(lambda _scope: manager, SYSTEM)
     assert caught.value.hint == "doractl --system disable robot"
 
 
-def test_without_systemd_the_files_are_enough() -> None:
-    def reach(_scope: Scope) -> FakeManager:
-        raise DoraSystemdError("cannot reach systemd", "", ExitCode.NO_SYSTEMD)
+def test_what_a_later_boot_uses_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The user's manager does not run, as after the last logout."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    refuse_if_needed(reach_nothing, USER)
+    links = tmp_path / "systemd/user/dora.target.wants"
+    links.mkdir(parents=True)
+    (links / "dora-robot.service").symlink_to("../dora-robot.service")
+    with pytest.raises(DoraSystemdError, match="a boot starts robot"):
+        refuse_if_needed(reach_nothing, USER)
 
-    assert tell_systemd(reach, USER) == ()
+
+def test_without_systemd_the_files_are_enough() -> None:
+    assert tell_systemd(reach_nothing, USER) == ()
