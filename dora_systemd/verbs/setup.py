@@ -132,7 +132,6 @@ def refuse_if_needed(reach: Callable[[Scope], Manager], scope: Scope) -> None:
         raise DoraSystemdError(
             f"cannot remove dora.target: a boot starts {', '.join(names)} with it",
             f"doractl {scope.flag} disable {' '.join(names)}",
-            ExitCode.USAGE,
         )
 
 

@@ -53,7 +53,7 @@ def test_not_while_it_is_needed(removed: set[Path], cell: Cell, project: Project
     assert cell.show("WantedBy") == "dora.target"
     there = files()
     done = run("doractl", "setup", "--remove", check=False)
-    assert (done.returncode, done.stdout) == (ExitCode.USAGE, "")
+    assert (done.returncode, done.stdout) == (ExitCode.FAILURE, "")
     assert cell.name in done.stderr
     assert files() == there
     assert there > removed

@@ -109,6 +109,7 @@ def test_what_is_in_use_stays(tmp_path: Path) -> None:
     with pytest.raises(DoraSystemdError, match="a boot starts robot") as caught:
         refuse_if_needed(lambda _scope: manager, SYSTEM)
     assert caught.value.hint == "doractl --system disable robot"
+    assert caught.value.code is ExitCode.FAILURE
 
 
 def test_what_a_later_boot_uses_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
