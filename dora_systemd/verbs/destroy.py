@@ -92,6 +92,12 @@ def stop_gateway(manager: Manager, scope: Scope) -> bool:
     return bool(up)
 
 
+def stop_gateway_of(manager: Manager, scope: Scope, files: Sequence[Path]) -> bool:
+    """Close the port if one of `files` is its unit, before that is removed; whether it was open."""
+    fragment = Path(manager.read(SOCKET_UNIT, ["FragmentPath"])["FragmentPath"])
+    return fragment in files and stop_gateway(manager, scope)
+
+
 def stop_slice(manager: Manager) -> list[str]:
     """Stop dora.target and dora.slice; the units of others that keep the slice active."""
     facts = manager.read(SLICE, ["LoadState", "ActiveState", "RequiredBy"])

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, run
+from tests.system.gateways import Front
 
 # Writes below /usr/local and to /etc/fish.
 pytestmark = pytest.mark.lab
@@ -58,6 +60,16 @@ def test_not_while_it_is_needed(removed: set[Path], cell: Cell, project: Project
     assert files() == there
     assert there > removed
     cell.doractl("disable", cell.name)
+
+
+def test_the_gateway_ends_with_its_units(removed: set[Path], front: Front) -> None:
+    run("doractl", "setup")
+    front.doractl("up")
+    assert front.show("FragmentPath", SOCKET_UNIT).startswith("/usr/local/lib/systemd/")
+    done = run("doractl", "setup", "--remove")
+    assert done.stdout.startswith("Gateway stopped\n")
+    assert front.show("ActiveState", SOCKET_UNIT) == "inactive"
+    assert files() == removed
 
 
 def test_users_have_their_own() -> None:

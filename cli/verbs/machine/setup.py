@@ -1,5 +1,7 @@
 """Install units, completions and manuals after pip install."""
 
+from collections.abc import Sequence
+
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
@@ -8,9 +10,14 @@ from dora_systemd.cli.parameters import (
     current_scope,
     print_outcomes,
     print_warnings,
+    tell,
 )
 from dora_systemd.decisions.views.outcome import Outcome, Thing
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.destroy import stop_gateway_of
 from dora_systemd.verbs.setup import (
+    Step,
     leave_no_state,
     packaged_unit,
     plan_setup,
@@ -43,6 +50,7 @@ def command(want_removal: bool) -> int:
     steps = plan_setup(scope)
     if want_removal:
         refuse_if_needed(Bus, scope)
+        _close_gateway(scope, steps)
     changed = take_away(steps) if want_removal else put_in_place(steps)
     if not changed:
         return _nothing("Nothing to remove." if want_removal else "Everything is installed.")
@@ -58,3 +66,13 @@ def command(want_removal: bool) -> int:
 
 def _nothing(text: str) -> int:
     return print_outcomes([Outcome(Thing(), text, is_news=False)])
+
+
+def _close_gateway(scope: Scope, steps: Sequence[Step]) -> None:
+    """Stop the gateway while systemd has its units; without systemd it does not run."""
+    try:
+        bus = Bus(scope)
+    except DoraSystemdError:
+        return
+    if stop_gateway_of(bus, scope, [step.path for step in steps if step.present is not None]):
+        tell("Gateway stopped")

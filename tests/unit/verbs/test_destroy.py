@@ -12,7 +12,13 @@ from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.names import SLICE
-from dora_systemd.verbs.destroy import processes_left, stop_all, stop_gateway, stop_slice
+from dora_systemd.verbs.destroy import (
+    processes_left,
+    stop_all,
+    stop_gateway,
+    stop_gateway_of,
+    stop_slice,
+)
 from dora_systemd.verbs.up import PORT_FILE
 from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
@@ -125,6 +131,17 @@ def test_the_gateway(systemd: Systemd, scope: ScopeIn) -> None:
     assert stop_gateway(systemd, scope)
     assert systemd.calls == [("StopUnit", SOCKET_UNIT), ("reload",)]
     assert [path.name for path in runtime.iterdir()] == ["dora-other.service"]
+
+
+def test_the_gateway_whose_unit_is_to_be_removed(systemd: Systemd, scope: ScopeIn) -> None:
+    unit = scope.root / "dora-gateway.socket"
+    state = {"LoadState": "loaded", "ActiveState": "active", "FragmentPath": str(unit)}
+    systemd.units[SOCKET_UNIT] = state
+    systemd.units[SERVICE_UNIT] = {"LoadState": "loaded", "ActiveState": "active"}
+    assert not stop_gateway_of(systemd, scope, [scope.root / "dora.slice"])
+    assert systemd.calls == []
+    assert stop_gateway_of(systemd, scope, [scope.root / "dora.slice", unit])
+    assert systemd.calls == [("StopUnit", SOCKET_UNIT, SERVICE_UNIT)]
 
 
 def test_a_gateway_that_was_killed_leaves_no_failed_unit(
