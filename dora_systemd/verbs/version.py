@@ -8,9 +8,11 @@ import platform
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from dora_systemd import __version__
+from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.dora.command import dora_version, find_dora
 from dora_systemd.decisions.machines.description import Facts
@@ -26,9 +28,18 @@ def read_versions(scope: Scope) -> dict[str, str | None]:
     return {
         "doractl": __version__,
         "python": platform.python_version(),
-        "systemd": _found(lambda: Bus(scope, for_reading=True).version()),
+        "systemd": systemd_version(partial(Bus, for_reading=True), scope),
         "dora": _found(lambda: dora_version(find_dora(None, os.environ.get("VIRTUAL_ENV"), path))),
     }
+
+
+def systemd_version(reach: Callable[[Scope], Manager], scope: Scope) -> str | None:
+    """The version of systemd, also while no manager of the user runs.
+
+    reach: opens the connection.
+    """
+    system = scope._replace(is_user=False)
+    return _found(lambda: reach(scope).version()) or _found(lambda: reach(system).version())
 
 
 def _found(read: Callable[[], str]) -> str | None:
