@@ -2,6 +2,7 @@
 
 import errno
 import os
+import pwd
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -32,8 +33,8 @@ class Scope(NamedTuple):
         """The parent of all StateDirectory= of the manager, see systemd.exec(5)."""
         if not self.is_user:
             return Path("/var/lib")
-        home, given = os.environ.get("HOME", ""), os.environ.get("XDG_STATE_HOME", "")
-        return Path(given if given.startswith("/") else f"{home}/.local/state")
+        given = os.environ.get("XDG_STATE_HOME", "")
+        return Path(given if given.startswith("/") else f"{home_of(os.environ)}/.local/state")
 
     def cell_directory(self, name: str) -> Path:
         """The RuntimeDirectory of the unit of dataflow `name`."""
@@ -80,6 +81,20 @@ def scope_of(is_user: bool | None) -> Scope:
     return Scope(is_user=uid != 0 if is_user is None else is_user, uid=uid)
 
 
+def home_of(environment: Mapping[str, str]) -> str:
+    """The caller's home directory, or "" if there is none.
+
+    As systemd does, this ignores a relative path in HOME, which would depend on the directory in
+    which a command is typed.
+    """
+    if (given := environment.get("HOME", "")).startswith("/"):
+        return given
+    try:
+        return pwd.getpwuid(os.getuid()).pw_dir
+    except KeyError:
+        return ""
+
+
 def config_home(environment: Mapping[str, str]) -> str:
     """A user's directory of configuration, or "" if the variables name none.
 
@@ -116,4 +131,4 @@ def place_hint(path: Path, error: OSError) -> str:
         return "see df"
     if str(path).startswith(_SYSTEM_PLACES):
         return "use sudo, or --user for a dataflow of your own"
-    return f"HOME is {os.environ.get('HOME', '')!r}: use one in which you can write"
+    return f"HOME is {home_of(os.environ)!r}: use one in which you can write"

@@ -32,7 +32,7 @@ from dora_systemd.decisions.unit.setup_files import (
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit
-from dora_systemd.scope import Scope, config_home
+from dora_systemd.scope import Scope, config_home, home_of
 from dora_systemd.verbs.facts.enabled import own_directories
 
 _PACKAGE = Path(__file__).parents[1]
@@ -101,11 +101,9 @@ def data_root(scope: Scope) -> Path:
     given = os.environ.get("XDG_DATA_HOME", "")
     if given.startswith("/"):
         return Path(given)
-    try:
-        return Path.home() / ".local/share"
-    except RuntimeError as error:
-        hint = "set HOME, or XDG_DATA_HOME"
-        raise DoraSystemdError("cannot find your home directory", hint) from error
+    if home := home_of(os.environ):
+        return Path(home, ".local/share")
+    raise DoraSystemdError("cannot find your home directory", "set HOME, or XDG_DATA_HOME")
 
 
 def packaged_unit(scope: Scope) -> str:

@@ -8,6 +8,7 @@ from dora_systemd.decisions.unit.setup_files import is_ours, setup_files
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.setup import (
+    data_root,
     plan_setup,
     put_in_place,
     refuse_if_needed,
@@ -95,6 +96,14 @@ def test_the_files_of_a_package_are_left_to_apt(tmp_path: Path) -> None:
     with pytest.raises(DoraSystemdError, match="the files of a package") as caught:
         plan_setup(SYSTEM, tmp_path, tmp_path / "dist-packages/dora_systemd")
     assert "apt remove" in caught.value.hint
+
+
+def test_a_relative_home_is_not_below_the_current_directory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    monkeypatch.setenv("HOME", "relative")
+    assert data_root(USER).is_absolute()
 
 
 def reach_nothing(_scope: Scope) -> FakeManager:

@@ -1,11 +1,15 @@
 """Machines that were not booted with systemd, and files that cannot be written: what to do."""
 
 import errno
+import os
+import pwd
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.scope import Scope, place_hint, without_systemd
+
+USER = Scope(is_user=True, uid=1000)
 
 
 @pytest.mark.parametrize(
@@ -40,6 +44,21 @@ def test_places_that_cannot_be_written(
 ) -> None:
     monkeypatch.setenv("HOME", "/root")
     assert place_hint(Path(path), OSError(number, "no")).startswith(hint)
+
+
+@pytest.mark.parametrize("given", ["relative", "", None])
+def test_a_home_that_depends_on_the_directory_is_ignored(
+    given: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
+    monkeypatch.setenv("HOME", "/home/joe")
+    assert USER.state_root == Path("/home/joe/.local/state")
+    if given is None:
+        monkeypatch.delenv("HOME")
+    else:
+        monkeypatch.setenv("HOME", given)
+    own = pwd.getpwuid(os.getuid()).pw_dir
+    assert USER.state_root == Path(own, ".local/state")
 
 
 @pytest.mark.parametrize(
