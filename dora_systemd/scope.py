@@ -1,8 +1,10 @@
 """System scope or user scope: selects the manager and its directories."""
 
+import contextlib
 import errno
 import os
 import pwd
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -127,8 +129,18 @@ def place_hint(path: Path, error: OSError) -> str:
     """Describe what to do if a file of doractl's own cannot be written at `path`."""
     if error.errno == errno.EROFS:
         return "the file system is mounted read-only"
-    if not isinstance(error, PermissionError):
-        return "see df"
+    is_refused = isinstance(error, PermissionError)
     if str(path).startswith(_SYSTEM_PLACES):
-        return "use sudo, or --user for a dataflow of your own"
-    return f"HOME is {home_of(os.environ)!r}: use one in which you can write"
+        return "use sudo, or --user for a dataflow of your own" if is_refused else "see df"
+    if is_refused and _is_in_own_home(path):
+        return f"a directory above it belongs to another user: namei -l {shlex.quote(str(path))}"
+    if is_refused or isinstance(error, FileNotFoundError | NotADirectoryError):
+        return f"HOME is {home_of(os.environ)!r}: use one in which you can write"
+    return "see df"
+
+
+def _is_in_own_home(path: Path) -> bool:
+    home = Path(home_of(os.environ))
+    with contextlib.suppress(OSError):
+        return path.is_relative_to(home) and home.stat().st_uid == os.getuid()
+    return False

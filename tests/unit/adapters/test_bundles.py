@@ -288,6 +288,6 @@ def test_what_cannot_be_used(tmp_path: Path) -> None:
     hint = "use sudo, or --user for a dataflow of your own"
     assert (refused.code, refused.hint) == (ExitCode.NO_PERMISSION, hint)
     assert stores.unusable(Path("/var/x"), error, ", or -o FILE").hint == f"{hint}, or -o FILE"
-    assert stores.unusable(Path("/root/.local/state"), error).hint.startswith("HOME is "), (
+    assert stores.unusable(Path("/home/joe/.local/state"), error).hint.startswith("HOME is "), (
         "sudo would search the bundles of the system, which are others"
     )

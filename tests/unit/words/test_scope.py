@@ -33,7 +33,8 @@ def test_machines_without_systemd(tmp_path: Path, file: str, text: str, expected
     ("path", "number", "hint"),
     [
         ("/var/lib/dora-systemd/releases/x", errno.EACCES, "use sudo, or --user for a dataflow"),
-        ("/root/.local/state/dora-systemd", errno.EACCES, "HOME is '/root': use one in which you"),
+        ("/home/joe/.local/state", errno.EACCES, "HOME is '/home/joe': use one in which you"),
+        ("/proc/.local/state", errno.ENOENT, "HOME is '/home/joe': use one in which you"),
         ("/home/joe/.config/systemd/user", errno.EROFS, "the file system is mounted read-only"),
         ("/var/lib/dora-systemd/releases/x", errno.EROFS, "the file system is mounted read-only"),
         ("/home/joe/.local/state", errno.ENOSPC, "see df"),
@@ -42,8 +43,17 @@ def test_machines_without_systemd(tmp_path: Path, file: str, text: str, expected
 def test_places_that_cannot_be_written(
     path: str, number: int, hint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("HOME", "/root")
+    monkeypatch.setenv("HOME", "/home/joe")
     assert place_hint(Path(path), OSError(number, "no")).startswith(hint)
+
+
+def test_a_directory_of_another_user_in_the_own_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    path = tmp_path / ".local/a b"
+    hint = place_hint(path, PermissionError(errno.EACCES, "no"))
+    assert hint == f"a directory above it belongs to another user: namei -l '{path}'"
 
 
 @pytest.mark.parametrize("given", ["relative", "", None])
