@@ -147,11 +147,6 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
         f"/tmp is private in the sandbox: --writable /tmp shares the one of the machine, {_MORE}",
     ),
     (
-        ("can't open file '/",),
-        "its file is not where it was: if somebody has replaced or removed its directory since the "
-        "start, only a restart of the dataflow finds the new one",
-    ),
-    (
         ("can't start new thread", "Resource temporarily unavailable"),
         "the limit of processes and threads may be reached: doractl set NAME --tasks-limit N, or "
         "--node NODE:tasks_limit=N, raises it",
@@ -164,6 +159,11 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
 """Parts of lines of the C library, Python and Rust, the clearest signs first."""
 
 
+_GONE = r"can't open file '/[^\n]*\[Errno 2\]"
+_WAS_THERE = (
+    "its file is not where it was: if somebody has replaced or removed its directory since the "
+    "start, only a restart of the dataflow finds the new one"
+)
 _FULL = (
     r"(?:No space left on device|Disk quota exceeded|ENOSPC|EDQUOT)"
     r"(?:[^\n'\"]{0,40}['\"](?P<path>/[^\n'\"]{1,200})['\"])?"
@@ -176,6 +176,8 @@ def known_remedy(lines: Iterable[str], node: str = "the node") -> str:
     text = "\n".join(lines)
     if full := re.search(_FULL, text):
         return _space(full["path"], node)
+    if re.search(_GONE, text):
+        return _WAS_THERE
     return next((help_ for signs, help_ in _SIGNS if any(one in text for one in signs)), "")
 
 

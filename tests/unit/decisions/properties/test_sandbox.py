@@ -398,6 +398,7 @@ def test_absolute_paths(tmp_path: Path) -> None:
         ("FileNotFoundError: [Errno 2] No such file or directory: '/dev/video0'", "--device"),
         ("FileNotFoundError: [Errno 2] No such file or directory: '/tmp/map'", "--writable /tmp"),
         ("python: can't open file '/srv/x.py': [Errno 2] No such file", "only a restart of the"),
+        ("python: can't open file '/srv/x.py': [Errno 13] Permission denied", ""),
         ("PermissionError: [Errno 1] Operation not permitted", "--sandbox none"),
         ("OSError: [Errno 97] Address family not supported by protocol", "--sandbox none"),
         ("FileNotFoundError: [Errno 2] No such file or directory: 'model.pt'", ""),
