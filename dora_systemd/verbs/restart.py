@@ -14,9 +14,10 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_absent
-from dora_systemd.values import shown
+from dora_systemd.values import shell_word, shown
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.containers import find_outside, with_left
+from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.facts.reason import job_reason, logs_hint, need_failure, runners_refusal
 from dora_systemd.verbs.node import NodeOrder, order_node, socket_of
@@ -68,7 +69,8 @@ def find_refusals(
     running = [cell for cell in cells if cell.has_begun]
     others = {cell: _other_version(cell) for cell in running if _is_of_other_version(cell)}
     lost = {cell: error for cell in running if (error := _lost_credential(manager, cell))}
-    others = lost | others
+    away = {cell: error for cell in running if (error := _lost_program(manager, scope, cell))}
+    others = lost | others | away
     asked = [
         (cell, beside(partial(_find_refusal, scope, cell, ask)))
         for cell in running
@@ -96,6 +98,19 @@ def _lost_credential(manager: Manager, cell: Cell) -> DoraSystemdError | None:
             message = f"cannot use {shown(file)} as credential {name}: there is no such file"
             return _kept(cell, bad_input(message, "put it back"))
     return None
+
+
+def _lost_program(manager: Manager, scope: Scope, cell: Cell) -> DoraSystemdError | None:
+    """The error for a Python that is gone, as when doractl was installed in another way since."""
+    program = next((one[0] for one in manager.read(cell.unit, ["ExecStart"])["ExecStart"]), "")
+    if not is_absent(program):
+        return None
+    start = f"doractl start {cell.name}"  # of an enabled one, that starts its unit file
+    if cell.unit in enabled_units(manager, scope):
+        start = f"doractl start --enable --name {cell.name} {shell_word(cell.options.dataflow)}"
+    how = "deploy its project again" if cell.release else f"doractl stop {cell.name}, then {start}"
+    message = f"cannot restart {cell.name}: {shown(program)}, which executes it, does not exist"
+    return bad_input(message, f"{cell.name} keeps running; instead: {how}")
 
 
 def require_startable(manager: Manager, scope: Scope, cell: Cell, ask: Ask = ask_refusal) -> None:

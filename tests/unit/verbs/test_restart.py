@@ -75,6 +75,25 @@ def test_a_dataflow_of_another_version_keeps_running(manager: FakeManager) -> No
     assert forced.text == f"Dataflow restarted: {UUID} (robot)"
 
 
+@pytest.mark.parametrize("is_enabled", [False, True])
+def test_a_dataflow_whose_python_is_gone_keeps_running(
+    manager: FakeManager, is_enabled: bool, tmp_path: Path
+) -> None:
+    """As after uv tool uninstall and an installation by pipx; its runner knows nothing of it."""
+    manager.etc, manager.kind = tmp_path, SCOPE.word
+    if is_enabled:
+        manager.enable_unit_files([UNIT])
+    manager.units[UNIT]["ExecStart"][0][0] = "/nowhere/bin/python"
+    (outcome,) = restart_cells(manager, SCOPE, read_cells(manager), BY, ask=accept)
+    assert outcome.code is ExitCode.BAD_INPUT
+    assert outcome.problem.endswith("/nowhere/bin/python, which executes it, does not exist")
+    start = "start --enable --name robot /srv/robot.yml" if is_enabled else "start robot"
+    assert outcome.hint == f"robot keeps running; instead: doractl stop robot, then doractl {start}"
+    assert not any(call[0] == "RestartUnit" and len(call) > 1 for call in manager.calls)
+    (forced,) = restart_cells(manager, SCOPE, read_cells(manager), BY, True, ask=accept)
+    assert forced.text == f"Dataflow restarted: {UUID} (robot)"
+
+
 def test_restart_that_the_runner_refuses(manager: FakeManager) -> None:
     """As a start: the hint is no part of the sentence."""
     said = format_refusal(REFUSAL)
