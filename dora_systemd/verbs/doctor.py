@@ -21,11 +21,10 @@ from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.real_time import read_real_time
 from dora_systemd.adapters.host.rivals import Interrupts
-from dora_systemd.adapters.host.unit_files import read_unit_file
 from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN, core_program
 from dora_systemd.decisions.settings.table import USER
-from dora_systemd.decisions.unit.file import BOOT_TARGET, runner_of
+from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.views.diagnosis import (
     DORA_PORTS,
     Process,
@@ -51,10 +50,10 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope, scope_of
 from dora_systemd.trust.files import read_file
-from dora_systemd.trust.paths import exists, is_absent
+from dora_systemd.trust.paths import exists
 from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sockets import TABLES, listening_sockets
-from dora_systemd.values import shell_word
+from dora_systemd.verbs.facts.boot import judge_enabled
 from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.list import dataflow_row
@@ -148,7 +147,7 @@ def _boot(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
     directory = own_directories(manager, scope)[0]
     lost = lost_units(manager, scope)
     for unit in sorted(enabled_units(manager, scope)):
-        findings = list(_enabled(directory / unit, scope))
+        findings = list(judge_enabled(directory / unit, scope))
         yield from findings
         if unit in lost and not findings:
             text = f"{unit} is enabled and systemd does not know it"
@@ -174,28 +173,6 @@ def _units(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:
             text = f"{one.unit} cannot be loaded: {one.load}"
             remedy = f"systemd-analyze {scope.flag} verify {one.unit}"
             yield Finding("units", State.WARNING, text, remedy)
-
-
-def _enabled(path: Path, scope: Scope) -> Iterator[Finding]:
-    """Check that the dataflows that are started at boot can start."""
-    try:
-        text = read_unit_file(path)
-    except DoraSystemdError as error:
-        yield Finding("boot", State.WARNING, error.message, error.hint)
-        return
-    options = runner_of(text or "")
-    if text is None or options is None:
-        broken = "is gone" if text is None else "starts no dataflow"
-        remedy = f"systemctl {scope.flag} disable {path.name}"
-        yield Finding("boot", State.WARNING, f"{path} is enabled and {broken}", remedy)
-    elif is_absent(options.dataflow):
-        text = f"{options.name} is enabled, but {options.dataflow} does not exist"
-        yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
-    elif runner_of(text, can_start=True) is None:
-        found = f"{options.name} cannot start at boot: another version has enabled it"
-        file = shell_word(options.dataflow)
-        remedy = f"doractl disable {options.name}, then doractl start --enable {file}"
-        yield Finding("boot", State.WARNING, found, remedy)
 
 
 def _leftovers(manager: Manager, scope: Scope, _root: Path) -> Iterator[Finding]:

@@ -34,6 +34,7 @@ HEADER = "# Written by doractl(1). To change something: systemctl edit, see dora
 
 _SECTION = r"\[([^\]]+)\]"
 _BLANKS = " \t\r"
+_COMMAND = r"ExecStart\s*=\s*\S"
 _COMMENT = rf"(?m)^[{_BLANKS}]*[#;].*\n?"
 _CONTINUED = rf"\\[{_BLANKS}]*(?:\n[{_BLANKS}]*|\Z)"
 _SPECIFIER = r"%[a-zA-Z]"
@@ -113,16 +114,24 @@ def runner_of(text: str, can_start: bool = False) -> RunnerOptions | None:
 
     can_start: None also for a file with options that this version does not know.
     """
-    lines = _sections([text]).get("Service", ())
-    commands = [line.partition("=")[2] for line in lines if re.match(r"ExecStart\s*=\s*\S", line)]
-    if len(commands) != 1:
-        return None
     try:
-        ((_, argv, _),) = parse_line("ExecStart", commands[0])["ExecStart"].value
-        command = [word.replace("%%", "%") for word in argv]
+        command = _command_of(text)
         return (options_from_command if can_start else known_options_from_command)(command)
     except (DoraSystemdError, ValueError):
         return None
+
+
+def program_of(text: str) -> str:
+    """The Python interpreter in a unit file of ours, which runner_of() accepts."""
+    return _command_of(text)[0]
+
+
+def _command_of(text: str) -> list[str]:
+    """The only command of ExecStart= in a unit file. Raises DoraSystemdError, ValueError."""
+    lines = _sections([text]).get("Service", ())
+    (command,) = (line.partition("=")[2] for line in lines if re.match(_COMMAND, line))
+    ((_, argv, _),) = parse_line("ExecStart", command)["ExecStart"].value
+    return [word.replace("%%", "%") for word in argv]
 
 
 def user_of(text: str) -> str:

@@ -3,6 +3,7 @@
 import errno
 import os
 import pwd
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -291,6 +292,23 @@ def test_an_enabled_dataflow_whose_file_is_gone(manager: FakeManager, scope: Sco
     (finding,) = found(manager, scope).values()
     assert finding.text == "robot is enabled, but /srv/robot.yml does not exist"
     assert finding.remedy == "doractl disable robot"
+
+
+def test_an_enabled_dataflow_whose_python_is_gone(
+    manager: FakeManager, scope: Scope, tmp_path: Path
+) -> None:
+    """As after uv tool uninstall and an installation by pipx."""
+    plan = make_plan(scope)
+    flow = tmp_path / "my robot.yml"
+    flow.touch()
+    plan = plan._replace(options=plan.options._replace(dataflow=str(flow)))
+    place(manager, plan, want_boot=True)
+    (unit,) = manager.etc.glob("systemd/*/dora-robot.service")
+    unit.write_text(unit.read_text().replace(sys.executable, "/nowhere/bin/python"))
+    finding = found(manager, scope)["boot"]
+    assert finding.text == "robot cannot start at boot: /nowhere/bin/python does not exist"
+    start = f"doractl start --enable --name robot '{flow}'"
+    assert finding.remedy == f"doractl stop robot, then {start}"
 
 
 def test_an_enabled_dataflow_where_the_caller_may_not_look(
