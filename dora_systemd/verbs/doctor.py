@@ -25,6 +25,7 @@ from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.decisions.cell.core_dumps import CORE_PATTERN, core_program
 from dora_systemd.decisions.settings.table import USER
 from dora_systemd.decisions.unit.file import BOOT_TARGET
+from dora_systemd.decisions.unit.setup_files import PACKAGED_UNIT
 from dora_systemd.decisions.views.diagnosis import (
     DORA_PORTS,
     Process,
@@ -318,14 +319,13 @@ def _upgrades(_scope: Scope, root: Path) -> Iterator[Finding]:
         yield from judge_reboots("\n".join(texts))
 
 
-def _user(scope: Scope, _root: Path) -> Iterator[Finding]:
+def _user(scope: Scope, root: Path) -> Iterator[Finding]:
     if scope.is_user:
         return
     try:
         entry = pwd.getpwnam(DEFAULT_USER)
     except KeyError:
-        text = f"there is no user {DEFAULT_USER} to run the dataflows of root's files"
-        yield Finding("user", State.NOTE, text, "doractl setup, or start them with --uid")
+        yield judge_no_user(root)
         return
     text = f"{DEFAULT_USER} runs the dataflows of root's files"
     if closed := unreadable_file(account_from(entry)):
@@ -334,6 +334,14 @@ def _user(scope: Scope, _root: Path) -> Iterator[Finding]:
         yield Finding("user", State.PROBLEM, f"{text}, and cannot read {closed}", remedy)
     else:
         yield Finding("user", State.OK, text)
+
+
+def judge_no_user(root: Path) -> Finding:
+    """The finding about a machine without the default user. root: has all files."""
+    text = f"there is no user {DEFAULT_USER} to run the dataflows of root's files"
+    # setup does nothing where a package is installed.
+    how = "systemd-sysusers" if _below(root, Path(PACKAGED_UNIT)).exists() else "doractl setup"
+    return Finding("user", State.NOTE, text, f"as root: {how}; or start them with --uid")
 
 
 def _settings(scope: Scope, root: Path) -> Iterator[Finding]:

@@ -151,7 +151,7 @@ def tell_systemd(reach: Callable[[Scope], Manager], scope: Scope) -> tuple[str, 
     """
     with contextlib.suppress(DoraSystemdError):
         reach(scope).reload()
-    if scope.is_user:
+    if scope.is_user or scope.uid:
         return ()
     state = ["systemd-tmpfiles", "--create", f"--prefix={store_root().parent}"]
     commands = (["systemd-sysusers"], state, ["journalctl", "--update-catalog"])

@@ -49,6 +49,14 @@ def test_setup_and_remove(removed: set[Path]) -> None:
     assert run("doractl", "setup", "--remove").stdout == "Nothing to remove.\n"
 
 
+def test_a_user_that_is_gone_is_made_again(removed: set[Path]) -> None:
+    run("doractl", "setup")
+    run("userdel", "dora")
+    assert run("doractl", "setup").stdout == "Everything is installed.\n"
+    assert run("id", "-un", "dora").stdout == "dora\n"
+    assert files() > removed
+
+
 def test_not_while_it_is_needed(removed: set[Path], cell: Cell, project: Project) -> None:
     run("doractl", "setup")
     cell.start(project.three_nodes(), "--enable")

@@ -52,8 +52,11 @@ def command(want_removal: bool) -> int:
         refuse_if_needed(Bus, scope)
         _close_gateway(scope, steps)
     changed = take_away(steps) if want_removal else put_in_place(steps)
+    if not changed and want_removal:
+        return _nothing("Nothing to remove.")
     if not changed:
-        return _nothing("Nothing to remove." if want_removal else "Everything is installed.")
+        print_warnings(tell_systemd(Bus, scope))  # the user dora may be gone
+        return _nothing("Everything is installed.")
     word = "Removed" if want_removal else "Installed"
     status = print_outcomes(
         Outcome(Thing(), f"{word}: {path}", details={"path": str(path)}) for path in changed

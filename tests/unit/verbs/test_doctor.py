@@ -16,7 +16,7 @@ from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.doctor import JOURNALD, examine, guarded
+from dora_systemd.verbs.doctor import JOURNALD, examine, guarded, judge_no_user
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.start.programs import version_warnings
 from tests.unit.fakes.cgroups import fake_cgroups
@@ -258,6 +258,15 @@ def test_dataflows_of_another_version(manager: FakeManager, scope: Scope) -> Non
     finding = found(manager, scope)["versions"]
     assert finding.text == f"robot: runs 0.0.9, {__version__} is installed"
     assert (finding.state, finding.remedy) == (State.NOTE, "doractl restart robot")
+
+
+def test_the_remedy_for_a_missing_user_makes_it(tmp_path: Path) -> None:
+    """setup does nothing where the package is installed."""
+    assert judge_no_user(tmp_path).remedy.startswith("as root: doractl setup;")
+    unit = tmp_path / "usr/lib/systemd/system/dora.slice"
+    unit.parent.mkdir(parents=True)
+    unit.touch()
+    assert judge_no_user(tmp_path).remedy.startswith("as root: systemd-sysusers;")
 
 
 def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
