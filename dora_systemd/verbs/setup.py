@@ -21,6 +21,7 @@ from dora_systemd.adapters.host.unit_files import (
 )
 from dora_systemd.adapters.releases.store import store_root
 from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.gateway.place import SERVICE_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.unit.setup_files import (
     PACKAGED_UNIT,
@@ -144,13 +145,19 @@ def _boot_directory(reach: Callable[[Scope], Manager], scope: Scope) -> Path:
     return of_user if scope.is_user else Path("/etc/systemd/system")
 
 
-def tell_systemd(reach: Callable[[Scope], Manager], scope: Scope) -> tuple[str, ...]:
+def tell_systemd(
+    reach: Callable[[Scope], Manager], scope: Scope, written: Sequence[Path] = ()
+) -> tuple[str, ...]:
     """Have systemd load the changes; warnings about what failed.
 
     reach: opens the connection. Without systemd, as in an image build, the next boot loads them.
+    written: the new files. A gateway of the old ones ends; the next connection starts the new one.
     """
     with contextlib.suppress(DoraSystemdError):
-        reach(scope).reload()
+        manager = reach(scope)
+        manager.reload()
+        if any(path.name == SERVICE_UNIT for path in written):
+            manager.run_jobs("StopUnit", [SERVICE_UNIT])
     if scope.is_user or scope.uid:
         return ()
     state = ["systemd-tmpfiles", "--create", f"--prefix={store_root().parent}"]

@@ -61,7 +61,7 @@ def command(want_removal: bool) -> int:
     status = print_outcomes(
         Outcome(Thing(), f"{word}: {path}", details={"path": str(path)}) for path in changed
     )
-    print_warnings(tell_systemd(Bus, scope))
+    print_warnings(tell_systemd(Bus, scope, () if want_removal else changed))
     if want_removal:
         leave_no_state(scope)
     return status

@@ -132,5 +132,15 @@ def test_what_a_later_boot_uses_stays(tmp_path: Path, monkeypatch: pytest.Monkey
         refuse_if_needed(reach_nothing, USER)
 
 
+def test_a_gateway_of_another_installation_ends() -> None:
+    """Its Python may be gone; the port stays open."""
+    manager = FakeManager()
+    unit = Path("/usr/local/lib/systemd/system/dora-gateway.service")
+    manager.units[unit.name] = {"ActiveState": "active"}
+    for written, ended in (([unit.with_name("dora.slice")], False), ([unit], True)):
+        assert tell_systemd(lambda _scope: manager, USER, written) == ()
+        assert (("StopUnit", unit.name) in manager.calls) is ended
+
+
 def test_without_systemd_the_files_are_enough() -> None:
     assert tell_systemd(reach_nothing, USER) == ()
