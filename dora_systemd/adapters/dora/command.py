@@ -75,7 +75,13 @@ def dora_version(
 
     Raises DoraSystemdError (NO_DORA) if it is none, or older than OLDEST_DORA.
     """
-    done = run_dora(dora, ["--version"], account, environment)
+    try:
+        done = run_dora(dora, ["--version"], account, environment)
+    except DoraSystemdError as error:
+        # Such as a script of an environment that was moved: its Python is gone.
+        if not isinstance(error.__cause__, OSError):
+            raise
+        raise DoraSystemdError(error.message, INSTALL_HINT, ExitCode.NO_DORA) from error
     version = parse_dora_version(done.stdout) if done.status == 0 else None
     if version is None:
         words = " ".join((done.stderr or done.stdout).split())[:200]

@@ -11,6 +11,16 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from tests.unit.fakes.programs import make_program
 
 
+def test_a_script_whose_interpreter_is_gone(tmp_path: Path) -> None:
+    """As in an environment that was moved."""
+    dora = tmp_path / "dora"
+    dora.write_text("#!/nowhere/bin/python\n")
+    dora.chmod(0o755)
+    with pytest.raises(DoraSystemdError, match=f"cannot run {dora}: No such file") as caught:
+        command.dora_version(str(dora))
+    assert (caught.value.code, caught.value.hint) == (ExitCode.NO_DORA, command.INSTALL_HINT)
+
+
 def test_dora_is_told_to_print_plainly(tmp_path: Path) -> None:
     dora = make_program(tmp_path / "dora", 'echo "$NO_COLOR $RUST_BACKTRACE $1"')
     assert command.run_dora(dora, ["validate"], None, {}).stdout == "1 0 validate\n"
