@@ -34,6 +34,7 @@ from dora_systemd.decisions.unit.setup_files import (
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit
 from dora_systemd.scope import Scope, config_home, home_of
+from dora_systemd.values import shown
 from dora_systemd.verbs.facts.enabled import own_directories
 
 _PACKAGE = Path(__file__).parents[1]
@@ -163,6 +164,18 @@ def tell_systemd(
     state = ["systemd-tmpfiles", "--create", f"--prefix={store_root().parent}"]
     commands = (["systemd-sysusers"], state, ["journalctl", "--update-catalog"])
     return tuple(filter(None, map(_run, commands)))
+
+
+def unsearched(reach: Callable[[Scope], Manager], scope: Scope) -> tuple[str, ...]:
+    """A warning if a user's systemd does not search the directory in which the units are now."""
+    if not scope.is_user:
+        return ()
+    with contextlib.suppress(DoraSystemdError):
+        if reach(scope).read(BOOT_TARGET, ["LoadState"])["LoadState"] == "not-found":
+            place = shown(str(data_root(scope)))
+            hint = "unset XDG_DATA_HOME for setup, or set it for systemd, too"
+            return (f"systemd does not search {place} for units: {hint}",)
+    return ()
 
 
 def _run(command: Sequence[str]) -> str:

@@ -25,6 +25,7 @@ from dora_systemd.verbs.setup import (
     refuse_if_needed,
     take_away,
     tell_systemd,
+    unsearched,
 )
 
 
@@ -56,6 +57,7 @@ def command(want_removal: bool) -> int:
         return _nothing("Nothing to remove.")
     if not changed:
         print_warnings(tell_systemd(Bus, scope))  # the user dora may be gone
+        print_warnings(unsearched(Bus, scope))
         return _nothing("Everything is installed.")
     word = "Removed" if want_removal else "Installed"
     status = print_outcomes(
@@ -64,6 +66,8 @@ def command(want_removal: bool) -> int:
     print_warnings(tell_systemd(Bus, scope, () if want_removal else changed))
     if want_removal:
         leave_no_state(scope)
+    else:
+        print_warnings(unsearched(Bus, scope))
     return status
 
 

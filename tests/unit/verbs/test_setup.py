@@ -14,6 +14,7 @@ from dora_systemd.verbs.setup import (
     refuse_if_needed,
     take_away,
     tell_systemd,
+    unsearched,
 )
 from tests.unit.checkout import CHECKOUT
 from tests.unit.fakes.manager import FakeManager
@@ -130,6 +131,19 @@ def test_what_a_later_boot_uses_stays(tmp_path: Path, monkeypatch: pytest.Monkey
     (links / "dora-robot.service").symlink_to("../dora-robot.service")
     with pytest.raises(DoraSystemdError, match="a boot starts robot"):
         refuse_if_needed(reach_nothing, USER)
+
+
+def test_a_directory_that_systemd_does_not_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """XDG_DATA_HOME is set in the shell only."""
+    monkeypatch.setenv("XDG_DATA_HOME", "/home/joe/data")
+    manager = FakeManager()
+    manager.units["dora.target"] = {"LoadState": "loaded"}
+    assert unsearched(lambda _scope: manager, USER) == ()
+    manager.units["dora.target"] = {"LoadState": "not-found"}
+    (warning,) = unsearched(lambda _scope: manager, USER)
+    assert warning.startswith("systemd does not search /home/joe/data for units: unset XDG")
+    assert unsearched(reach_nothing, USER) == ()
+    assert unsearched(lambda _scope: manager, SYSTEM) == ()
 
 
 def test_a_gateway_of_another_installation_ends() -> None:
