@@ -4,10 +4,11 @@ import contextlib
 import errno
 import os
 import pwd
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
+
+from dora_systemd.values import shell_word
 
 RUNTIME_NAME = "dora-systemd"
 NOTICE_NAME = "dora-systemd-notice"
@@ -133,7 +134,7 @@ def place_hint(path: Path, error: OSError) -> str:
     if str(path).startswith(_SYSTEM_PLACES):
         return "use sudo, or --user for a dataflow of your own" if is_refused else "see df"
     if is_refused and _is_in_own_home(path):
-        return f"a directory above it belongs to another user: namei -l {shlex.quote(str(path))}"
+        return f"a directory above it belongs to another user: namei -l {shell_word(str(path))}"
     if is_refused or isinstance(error, FileNotFoundError | NotADirectoryError):
         return f"HOME is {home_of(os.environ)!r}: use one in which you can write"
     return "see df"

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, bad_input
-from dora_systemd.values import shown
+from dora_systemd.values import shell_word, shown
 
 _MAX_LINKS = 40
 STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -80,7 +80,8 @@ def hint_of_changeable(path: Path, roots: Path, otherwise: str) -> str:
 
     roots: the file that root is meant to write. otherwise: what to do instead of using another one.
     """
-    return f"chown root: {roots}; chmod go-w {roots}" if path == roots else otherwise
+    file = shell_word(str(roots))
+    return f"chown root: {file}; chmod go-w {file}" if path == roots else otherwise
 
 
 @contextlib.contextmanager

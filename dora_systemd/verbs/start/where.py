@@ -36,7 +36,7 @@ from dora_systemd.trust.files import read_file, unreadable
 from dora_systemd.trust.paths import Place, reached, refusal, user_name
 from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.trust.sight import Sight, cannot_reach
-from dora_systemd.values import quoted, shown
+from dora_systemd.values import quoted, shell_word, shown
 from dora_systemd.verbs.start.on_failure import find_command
 from dora_systemd.verbs.start.programs import check_program
 from dora_systemd.verbs.start.read import Files
@@ -107,7 +107,7 @@ class Look(NamedTuple):
             self._blame(VENV, f"{venv}/bin/python", _OWN.exists(f"{venv}/bin/python"))
             raise bad_input(
                 f"cannot use {venv} as virtual environment: it has no bin/python",
-                f"python3 -m venv {venv}",
+                f"python3 -m venv {shell_word(venv)}",
             )
         return self._usable([venv], is_unbuilt=False) or venv
 
