@@ -304,3 +304,28 @@ def test_unknown_node(cell: Cell, project: Project) -> None:
     assert "the node 'sinc': no such node" in done.stderr
     assert "did you mean sink" in done.stderr
     assert cell.show("LoadState") == "not-found"
+
+
+FREEZE_SECONDS = 22
+"""Longer than the 20 s after which dora's daemon and coordinator give each other up."""
+AFTER_FREEZE = ("heartbeat", "failed watchdog", "syncing transport", "close message", "Discarding")
+
+
+@pytest.mark.warns(*CRASHES, *KILLED, *AFTER_FREEZE)
+def test_a_freeze_does_not_blind_it(cell: Cell, project: Project) -> None:
+    """dora connects anew after it, and forgets who has subscribed to the events of the run."""
+    cell.start(project.three_nodes(), "--node", "source:restart_policy=on-failure")
+    cell.systemctl("freeze")
+    time.sleep(FREEZE_SECONDS)  # there is nothing to wait for
+    cell.systemctl("thaw")
+    (old,) = cell.pids("node-source")
+    sink = cell.status.nodes["sink"].pid
+    restart = ("node", "restart", cell.name, "sink")
+    # dora refuses it until its daemon is back.
+    wait_for("a restart", lambda: cell.doractl(*restart, check=False).returncode == 0)
+    wait_for("its process is known", lambda: cell.status.nodes["sink"].pid not in (0, sink))
+    os.kill(old, signal.SIGKILL)
+    wait_for("the crash is seen", lambda: ("node-crashed", "source") in cell.events())
+    wait_for("it runs again", lambda: cell.status.nodes["source"].pid not in (0, old))
+    cell.doractl("node", "stop", cell.name, "source")
+    wait_for("it is stopped", lambda: cell.status.nodes["source"].state == "stopped")

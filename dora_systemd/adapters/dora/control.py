@@ -13,6 +13,7 @@ from dora_systemd.decisions.dora.protocol import (
     Params,
     Reply,
     encode_request,
+    ends_subscription,
     parse_coordinator,
     parse_frame,
 )
@@ -81,11 +82,17 @@ class Connection:
         except (OSError, WebSocketException) as error:
             raise _silent(params, error) from error
 
-    async def read_events(self, on_record: Callable[[LogRecord], None]) -> None:
-        """Pass every event to on_record until either side closes the connection."""
+    async def read_events(self, on_record: Callable[[LogRecord], None]) -> bool:
+        """Pass every event to on_record until either side closes the connection.
+
+        Return True if only the subscription has ended, and not the run.
+        """
         async for text in self.frames():
             if isinstance(frame := parse_frame(text), LogRecord):
                 on_record(frame)
+                if ends_subscription(frame):
+                    return True
+        return False
 
     async def frames(self) -> AsyncIterator[str | bytes]:
         """Every message, until either side closes the connection."""

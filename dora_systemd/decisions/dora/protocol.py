@@ -159,6 +159,19 @@ def subscribe_params(run: str) -> Params:
     return {"LogSubscribe": {"dataflow_id": run, "level": "Debug"}}
 
 
+_UNSUBSCRIBED = "all daemons running this dataflow disconnected"
+
+
+def ends_subscription(record: LogRecord) -> bool:
+    """Whether the coordinator sends no more records after this one.
+
+    It forgets a run, and who has subscribed to it, when it loses its last daemon, as after a freeze
+    of 20 s. The connection stays open. When the daemon is back, the run can be subscribed to again.
+    """
+    is_own = record.target == "coordinator" and not record.node
+    return is_own and record.message.startswith(_UNSUBSCRIBED)
+
+
 def wait_spawn_params(run: str) -> Params:
     """Wait until dora has executed all nodes; the reply may be why it could not execute one."""
     return {"WaitForSpawn": {"dataflow_id": run}}

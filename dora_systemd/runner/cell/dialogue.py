@@ -6,6 +6,7 @@ becomes an event of the pump, and so does every exception.
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -44,6 +45,9 @@ _QUIET_SECONDS = 0.1
 _WAITING_SECONDS = 1.0
 """Time for the effect of a stop on other nodes to be seen, if there are any."""
 _LONG_SECONDS = 3600.0 * 24 * 365
+_REJOIN_SECONDS = 0.2
+_LOST_SECONDS = 2.0
+"""Time for what dora has to report of the time before a subscription."""
 _NOTE_SECONDS = 1.0
 """Time for dora's next record about a node that has exited. It comes at once, but on a busy machine
 there is time between the two."""
@@ -171,9 +175,42 @@ class Dialogue(Tasks):
         def subscribed() -> None:
             self._pump.push(life.Subscribed(now_us()))
 
-        await self._engine.read_events(self._pump.cell.run, subscribed, self._hear)
+        has_more = await self._engine.read_events(self._pump.cell.run, subscribed, self._hear)
+        while has_more:
+            has_more = await self._subscribe_again()
         await self._let_exit_come()
         self._events_ended()
+
+    async def _subscribe_again(self) -> bool:
+        """Subscribe when dora knows the run again; as read_events().
+
+        dora forgets the run while its daemon is not connected. watch_dora() ends the cell if the
+        daemon does not come back.
+        """
+        while True:
+            await asyncio.sleep(_REJOIN_SECONDS)
+            with suppress(DoraSystemdError):
+                return await self._engine.read_events(
+                    self._pump.cell.run,
+                    lambda: self.spawn("find the ends that dora has lost", self._find_lost_ends()),
+                    self._hear,
+                )
+
+    async def _find_lost_ends(self) -> None:
+        """Give the cell up if a node has ended while its daemon could not report that."""
+        before = self._gone()
+        await asyncio.sleep(_LOST_SECONDS)
+        lost = sorted(before & self._gone())
+        if lost and self._pump.cell.state is State.RUNNING:
+            nodes = ", ".join(node for node, _ in lost)
+            reason = f"the dora daemon was not connected when a node ended: {nodes}"
+            self._pump.push(life.ConnectionLost(now_us(), reason=reason))
+
+    def _gone(self) -> set[tuple[str, int]]:
+        """The nodes here, each with its last known process, of which that has ended."""
+        known = self._pump.cell.nodes.items()
+        pids = {(node, one.pid) for node, one in known if one.pid and self._is_here(node)}
+        return {one for one in pids if not self._nodes.has_process(*one)}
 
     def _events_ended(self) -> None:
         """Report that the coordinator sends no more events of the run."""

@@ -151,15 +151,19 @@ class Engine:
         return str(protocol.result_of(reply, "DataflowStartTriggered")["uuid"])
 
     async def read_events(
-        self, run: str, on_start: Callable[[], None], on_record: OnRecord
-    ) -> None:
-        """Subscribe to a run, call on_start, and pass its events to on_record until the end."""
+        self, run: str, on_start: Callable[[], object], on_record: OnRecord
+    ) -> bool:
+        """Subscribe to a run, call on_start, and pass its events to on_record until the end.
+
+        Return True if only the subscription has ended, and not the run. Raises
+        DoraSystemdError if dora does not know the run.
+        """
         with closing(await self.connect()) as connection:
             reply = await connection.request(protocol.subscribe_params(run))
             if reply.error:
                 raise DoraSystemdError(f"cannot read events of dora: {reply.error}")
             on_start()
-            await connection.read_events(on_record)
+            return await connection.read_events(on_record)
 
     def is_exiting(self) -> bool:
         """Return whether coordinator or daemon has exited or is exiting."""

@@ -192,6 +192,8 @@ class FakeDora(Engine):
         self.refuses: dict[str, str] = {}
         self.hear: Callable[[LogRecord], None] | None = None
         self.closed, self.joined = asyncio.Event(), asyncio.Event()
+        # How often `closed` is the end of the subscription only, and dora then refuses another one.
+        self.unsubscribes = self.forgets = 0
         self.port = 0
         self.silent = ""
         self.hangs = False
@@ -247,12 +249,19 @@ class FakeDora(Engine):
         return str(reply.result)
 
     async def read_events(
-        self, run: str, on_start: Callable[[], None], on_record: Callable[[LogRecord], None]
-    ) -> None:
+        self, run: str, on_start: Callable[[], object], on_record: Callable[[LogRecord], None]
+    ) -> bool:
         self.calls.append(("subscribe", run))
+        if self.forgets:
+            self.forgets -= 1
+            raise DoraSystemdError("cannot read events of dora: no running dataflow")
         self.hear = on_record
         on_start()
         await self.closed.wait()
+        has_more, self.unsubscribes = self.unsubscribes > 0, max(self.unsubscribes - 1, 0)
+        if has_more:
+            self.closed.clear()
+        return has_more
 
     def dismiss_daemon(self) -> bool:
         self.calls.append(("dismiss",))

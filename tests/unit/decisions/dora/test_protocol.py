@@ -171,6 +171,18 @@ def test_the_heartbeats_of_all_machines() -> None:
 
 
 @pytest.mark.parametrize(
+    ("target", "message", "is_end"),
+    [
+        ("coordinator", "all daemons running this dataflow disconnected; waiting for it", True),
+        ("coordinator", "dataflow finished", False),
+        ("stdout", "all daemons running this dataflow disconnected; says a node", False),
+    ],
+)
+def test_the_end_of_a_subscription(target: str, message: str, is_end: bool) -> None:
+    assert protocol.ends_subscription(LogRecord("warn", target, "", message)) == is_end
+
+
+@pytest.mark.parametrize(
     ("error", "failure"),
     [
         ("", ""),

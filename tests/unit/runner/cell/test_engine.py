@@ -254,6 +254,9 @@ def test_what_is_left_of_the_two_is_killed_and_reaped(tmp_path: Path) -> None:
     live(tmp_path, work)
 
 
+FORGOTTEN = "all daemons running this dataflow disconnected; waiting for daemon reconnect"
+
+
 class Coordinator:
     """Speaks for dora's: each request gets the next of `answers`, and none waits for ever."""
 
@@ -276,7 +279,10 @@ class Coordinator:
                 await socket.send(json.dumps({"id": frame["id"], "result": result}))
             if name == "LogSubscribe":
                 for message in self.events:
-                    payload = {"target": "daemon", "node_id": "a", "message": message}
+                    target, node = (
+                        ("coordinator", None) if message == FORGOTTEN else ("daemon", "a")
+                    )
+                    payload = {"target": target, "node_id": node, "message": message}
                     await socket.send(json.dumps({"event": "log", "payload": payload}))
                 return
 
@@ -349,12 +355,29 @@ def test_a_run_and_its_events(tmp_path: Path) -> None:
         assert start["local_working_dir"] == str(CellPaths(tmp_path).work)
         with pytest.raises(DoraSystemdError, match="no such node"):
             await engine.start_run({"nodes": []}, "robot")
-        await engine.read_events(RUN, lambda: heard.append(None), heard.append)
+        assert not await engine.read_events(RUN, lambda: heard.append(None), heard.append)
         first, *records = heard
         assert first is None, "it is told that it has begun, before anything comes"
         assert [one.message for one in records if one] == ["node is ready", "hello"]
         with pytest.raises(DoraSystemdError, match="cannot read events of dora: unknown run"):
             await engine.read_events(RUN, lambda: None, heard.append)
+
+    with_coordinator(tmp_path, dora, work)
+
+
+def test_a_run_that_the_coordinator_forgets(tmp_path: Path) -> None:
+    dora = Coordinator()
+    dora.answers = {
+        "DaemonConnected": [{"DaemonConnected": True}],
+        "LogSubscribe": [{"subscribed": True}],
+    }
+    dora.events = ["node is ready", FORGOTTEN, "not read"]
+    heard: list[LogRecord] = []
+
+    async def work(engine: Engine) -> None:
+        await engine.wait_joined()
+        assert await engine.read_events(RUN, lambda: None, heard.append), "the run goes on"
+        assert [one.message for one in heard] == dora.events[:2]
 
     with_coordinator(tmp_path, dora, work)
 

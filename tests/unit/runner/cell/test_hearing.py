@@ -36,6 +36,40 @@ def test_a_subscription_and_its_end(tmp_path: Path) -> None:
     live(work)
 
 
+@pytest.mark.parametrize("is_alive", [True, False])
+def test_a_run_that_dora_has_forgotten_for_a_while(tmp_path: Path, is_alive: bool) -> None:
+    """After a freeze the daemon connects anew, and what it could not report is lost."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.nodes.living = {("a", 7)} if is_alive else set()
+        await bench.do(Do.SUBSCRIBE)
+        bench.dora.unsubscribes, bench.dora.forgets = 1, 3
+        bench.dora.closed.set()
+        await asyncio.sleep(2)
+        assert bench.calls.count(("subscribe", "run")) == 5
+        await asyncio.sleep(2)
+        reason = "the dora daemon was not connected when a node ended: a"
+        lost = [] if is_alive else [life.ConnectionLost(0, reason=reason)]
+        assert bench.heard == [life.Subscribed(0), *lost]
+
+    live(work)
+
+
+def test_an_end_that_dora_reports_late_is_not_lost(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        await bench.do(Do.SUBSCRIBE)
+        bench.dora.unsubscribes = 1
+        bench.dora.closed.set()
+        await asyncio.sleep(1)
+        bench.pump.cell = replace(bench.pump.cell, nodes={"a": NodeStatus("failed")})
+        await asyncio.sleep(3)
+        assert bench.heard == [life.Subscribed(0)]
+
+    live(work)
+
+
 async def hear(bench: Bench, *messages: str, node: str = "a") -> Calls:
     """What is done about lines of dora's about a node."""
     await bench.do(Do.SUBSCRIBE)
