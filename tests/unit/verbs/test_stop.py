@@ -121,7 +121,9 @@ def test_the_links_of_a_head_end_with_it(is_restarted: bool) -> None:
     if is_restarted:
         manager.job_results[UNIT] = "canceled"
         manager.after_job[UNIT] = {"ActiveState": "deactivating", "Job": [7, "/job"]}
-    stop_cells(manager, SCOPE, read_cells(manager))
+    cells = read_cells(manager)
+    assert cells[0].has_options, "they are read once, as by the commands"
+    stop_cells(manager, SCOPE, cells)
     assert (("StopUnit", link) in manager.calls) is not is_restarted
 
 
