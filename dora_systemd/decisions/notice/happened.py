@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
+from dora_systemd.decisions.life.causes import result_words
 from dora_systemd.decisions.life.kills import Kills, life_of
 from dora_systemd.decisions.logs.journal_events import (
     BUNDLE_WRITTEN,
@@ -90,6 +91,7 @@ def read_story(
     """
     found: list[Happened] = []
     causes: dict[str, tuple[str, str, str]] = {}
+    results: dict[str, str] = {}
     kills = Kills()
     bound = last.until_us if last else now_us - LOOK_BACK
     for record in islice(records, MOST_RECORDS):
@@ -109,8 +111,10 @@ def read_story(
             causes.setdefault(life, (_first_node(record), reason, _uuid(record)))
         elif one := _happened(record, event, mono_us):
             found.append(one)
+            if one.what == FAILED:
+                results[one.cause] = result_words(str(record.get("UNIT_RESULT", "")))
     failures = (one for one in found if one.what != FAILED or one.cause not in kills.requested)
-    return [_with_cause(one, causes) for one in failures], last
+    return [_with_cause(one, causes, results) for one in failures], last
 
 
 def has_lost_power(records: Iterable[Mapping[str, Any]], boot: str) -> bool:
@@ -156,10 +160,13 @@ def _uuid(record: Mapping[str, Any]) -> str:
     return text if is_uuid(text) else ""
 
 
-def _with_cause(one: Happened, causes: Mapping[str, tuple[str, str, str]]) -> Happened:
+def _with_cause(
+    one: Happened, causes: Mapping[str, tuple[str, str, str]], results: Mapping[str, str]
+) -> Happened:
+    """Add what the runner wrote in that life; without that, what the result of systemd means."""
     if one.what != FAILED:
         return one
-    node, cause, uuid = causes.get(one.cause, ("", "", ""))
+    node, cause, uuid = causes.get(one.cause, ("", results.get(one.cause, ""), ""))
     # A user's manager does not record the dataflow.
     return one._replace(node=node, cause=cause, uuid=one.uuid or uuid)
 

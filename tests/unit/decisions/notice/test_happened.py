@@ -159,6 +159,11 @@ def test_a_kill_that_was_requested_is_no_failure(records: list[dict[str, Any]], 
 def test_a_failure_that_the_runner_could_not_record() -> None:
     (one,) = read_story([unit_failed(999, "1")], "b", NOW)[0]
     assert (one.what, one.node, one.cause) == ("failed", "", "")
+    of_systemd = {**unit_failed(999, "1"), "UNIT_RESULT": "oom-kill"}
+    (one,) = read_story([of_systemd], "b", NOW)[0]
+    assert one.cause == "it ran out of memory"
+    (one,) = read_story([of_systemd, failed(998, "1", "the daemon is gone")], "b", NOW)[0]
+    assert one.cause == "the daemon is gone"
 
 
 @pytest.mark.parametrize(
