@@ -84,8 +84,15 @@ def encode_request(params: Params) -> tuple[str, str]:
     return ident, json.dumps({"id": ident, "method": "control", "params": params})
 
 
+MOST_FRAME = 8 * 1024 * 1024
+"""Maximum length of a frame that is parsed, which takes up to 20 times as much memory. A frame of
+dora has at most one descriptor, of 1 MiB, with escapes."""
+
+
 def parse_frame(text: str | bytes) -> Reply | LogRecord | None:
-    """A frame of the coordinator; None if it is not relevant."""
+    """A frame of the coordinator; None if it is not relevant, or longer than any of dora."""
+    if len(text) > MOST_FRAME:
+        return None
     try:
         frame = json.loads(text)
     except (ValueError, RecursionError):

@@ -1,6 +1,7 @@
 """Frames of dora 1.1, as they were seen on the wire."""
 
 import json
+import tracemalloc
 
 import pytest
 from hypothesis import given
@@ -236,3 +237,18 @@ def test_exit_value(kind: str, number: object, text: str) -> None:
 )
 def test_an_error_without_its_place(text: str, line: str) -> None:
     assert protocol.first_line(text) == line
+
+
+def test_a_frame_that_takes_much_memory_is_not_parsed() -> None:
+    """A coordinator is its user's, and root's doractl and gateway send it requests."""
+    for size, is_read in ((protocol.MOST_FRAME, True), (protocol.MOST_FRAME + 1, False)):
+        frame = '{"id": "a", "result": "%s"}'
+        text = frame % ("x" * (size - len(frame) + 2))
+        assert len(text) == size
+        assert (protocol.parse_frame(text) is not None) == is_read
+    tracemalloc.start()
+    try:
+        assert protocol.parse_frame('{"id": "a", "result": [' + "[]," * 10_000_000 + "0]}") is None
+        assert tracemalloc.get_traced_memory()[1] < 100_000_000
+    finally:
+        tracemalloc.stop()
