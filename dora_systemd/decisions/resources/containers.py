@@ -49,6 +49,7 @@ class Container(NamedTuple):
     group: str = ""  # its cgroup, "" if that is not known
     memory: int | None = None
     is_inside: bool = False  # whether it is in the cgroup of the node, whose limits hold then
+    user: str = ""  # whose podman has it, "" for root's and the caller's
 
     def __str__(self) -> str:
         if not self.id:
@@ -59,8 +60,10 @@ class Container(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """The command that stops it."""
-        return f"{self.program} stop {self.name or self.id[:_SHORT]}" if self.id else ""
+        """The command that stops it: root's podman has other containers, also of that name."""
+        command = f"{self.program} stop {self.name or self.id[:_SHORT]}"
+        command += f", as {self.user}" if self.user else ""
+        return command if self.id else ""
 
     @property
     def labels(self) -> dict[str, str]:

@@ -3,6 +3,7 @@
 Nothing is asked of podman or docker: a socket of theirs is its owner's, and as good as root.
 """
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -30,6 +31,7 @@ from dora_systemd.decisions.resources.containers import (
 from dora_systemd.decisions.resources.usage import WHOLE_CELL
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.trust.paths import user_name
 
 _MOST_GROUPS = 10_000
 
@@ -67,7 +69,8 @@ def _of_monitor(
     place = f"/{own.relative_to(cgroup.mount_point())}"
     pids = children.get(client.pid, ())
     inner = next((group for pid in pids if (group := process_group(pid, proc))), "")
-    return container_of(client, inner, place)
+    user = "" if client.uid in (0, os.geteuid()) else user_name(client.uid)
+    return container_of(client, inner, place)._replace(user=user)
 
 
 def _add_of_daemons(

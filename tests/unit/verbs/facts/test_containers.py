@@ -78,6 +78,24 @@ def test_podman_in_a_scope(machine: Machine) -> None:
     assert machine.read() == {"policy": [("podman", ID, False)]}
 
 
+def test_whose_podman_stops_a_container(machine: Machine) -> None:
+    """The owner chooses the name, which may be that of a container of root."""
+    scope, uid = f"/user.slice/libpod-{ID}.scope/container", 54321
+    for pid, group, words, parent in (
+        (11, NODE, ("podman", "run", "x"), 1),
+        (12, NODE, ("conmon", "-c", ID, "-n", "web"), 1),
+        (13, scope, ("sleep",), 12),
+    ):
+        machine.add(pid, group, *words, parent=parent)
+    groups = {"policy": machine.mount / NODE[1:]}
+    (own,) = read_containers(groups, machine.proc)["policy"]
+    assert own.remedy == "podman stop web"
+    for pid in (11, 12):
+        (machine.proc / f"{pid}/status").write_text(f"Uid:\t0\t{uid}\t0\t0\nNSpid:\t7\n")
+    (hers,) = read_containers(groups, machine.proc)["policy"]
+    assert hers.remedy == f"podman stop web, as uid {uid}"
+
+
 def test_podman_that_has_not_begun(machine: Machine) -> None:
     machine.add(11, NODE, "podman", "run", "x")
     assert machine.read() == {}
