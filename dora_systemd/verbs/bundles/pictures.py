@@ -64,7 +64,8 @@ def read_pictures(
 def _of_ring(ring: RingFile) -> list[LastPicture]:
     # ValueError: the user of the nodes has written to the ring.
     with closing(ring), suppress(ValueError):
-        return _pictures(_in_ring(Reading(ring, ring.size, MOST_BYTES)), "")
+        records = _MOST_MESSAGES * MOST_CAMERAS  # of all outputs: any of them may be damaged
+        return _pictures(_in_ring(Reading(ring, ring.size, MOST_BYTES, records)), "")
     return []
 
 
