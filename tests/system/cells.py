@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -47,9 +48,10 @@ for event in node:
 # A machine of the lab has little time to spare for how often a test polls and how often a node
 # sends.
 IS_SLOW = os.environ.get("LAB") in ("vm", "emulator")
-TICK = f"dora/timer/millis/{250 if IS_SLOW else 50}"
+TICK = f"dora/timer/millis/{250 if IS_SLOW else 100}"
 POLL_SECONDS = 0.5 if IS_SLOW else 0.02
 LONGEST_POLL_SECONDS = 1.0 if IS_SLOW else 0.2
+DEAREST_POLL_SECONDS = 1.0
 THREE_NODES = f"""
 nodes:
   - id: source
@@ -68,18 +70,23 @@ nodes:
 
 def wait_for(what: str, condition: Callable[[], T], seconds: float = 30.0) -> T:
     """What `condition` gives as soon as that is true; fails after `seconds` of an idle machine."""
-    begun = asked = time.monotonic()
+    begun, spent = time.monotonic(), processor_time()
     while not (value := condition()):
-        now = time.monotonic()
-        waited, taken = now - begun, now - asked
+        waited, cost = time.monotonic() - begun, processor_time() - spent
         is_over = waited > seconds and waited > bound(seconds)
         assert not is_over, f"not within {seconds} s, {pace():.1f} times that here: {what}"
         # What takes long is polled less often, and so is what costs much: a poll can be a process,
         # and the other tests need the processor.
-        pause = min(max(waited / 10, 2 * taken), LONGEST_POLL_SECONDS)
+        pause = max(min(waited / 10, LONGEST_POLL_SECONDS), min(3 * cost, DEAREST_POLL_SECONDS))
         time.sleep(max(POLL_SECONDS, pause))
-        asked = time.monotonic()
+        spent = processor_time()
     return value
+
+
+def processor_time() -> float:
+    """Seconds that this process and the children that it has waited for have used."""
+    used = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def run(*command: str, check: bool = True, **options: Any) -> subprocess.CompletedProcess[str]:
