@@ -183,7 +183,8 @@ def uuids(dora: Dora) -> dict[str, str]:
 def test_topics_and_parameters(dora: Dora, three: list[Cell]) -> None:
     said = dora("topic", "echo", "-d", "two", "source/number", "--count", "3", "--format", "json")
     values = [json.loads(line)["data"][0] for line in said.stdout.splitlines()]
-    assert values == list(range(values[0], values[0] + 3))
+    assert values == sorted({*values}), "dora may leave some out on its way to the coordinator"
+    assert len(values) == 3
     assert "source/number" in dora("topic", "hz", "-d", "one", "--duration", "1").stdout
     assert (
         "doubler/number"
