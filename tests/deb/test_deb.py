@@ -270,6 +270,19 @@ def test_stop_and_start_after_that(flows: dict[str, Path]) -> None:
     start(flows)
 
 
+CHECKED = Path("/etc/systemd/system/boot-complete.target.requires/dora-robot.service")
+
+
+def test_an_installation_requires_again_what_a_boot_depended_on() -> None:
+    """The removal below takes the link away, and nothing else of what is enabled."""
+    sh("doractl enable robot --boot-check")
+    target = CHECKED.readlink()
+    CHECKED.unlink()
+    for _ in range(2):
+        sh("/var/lib/dpkg/info/dora-systemd.postinst configure 0.1.0")
+        assert CHECKED.readlink() == target
+
+
 def test_remove_stops_dataflows_and_leaves_configuration(before: set[str]) -> None:
     config = Path("/etc/dora-systemd/config.yml")
     config.write_text("grace_duration: 5s\n")
@@ -277,7 +290,11 @@ def test_remove_stops_dataflows_and_leaves_configuration(before: set[str]) -> No
     packages.apt("remove", "--yes", *packages.PACKAGES)
     assert not dora_processes()
     assert sh("systemctl list-units --all --plain --no-legend 'dora[-.]*'").stdout == ""
-    kept = (config, Path("/etc/needrestart/conf.d/50-dora-systemd.conf"))
+    # The boot check of a dataflow that cannot start would fail, and the boot loader could go back.
+    assert not CHECKED.is_symlink()
+    unit = Path("/etc/systemd/system", CHECKED.name)
+    enabled = (unit, unit.with_name("dora.target.wants") / unit.name)
+    kept = (config, Path("/etc/needrestart/conf.d/50-dora-systemd.conf"), *enabled)
     assert left(before) == {str(path) for one in kept for path in (one, *one.parents[:-1])} - before
 
 
