@@ -48,7 +48,7 @@ def set_limits(
     flags: Mapping[str, object],
     is_forced: bool = False,
     ask: Ask = order,
-    first: Callable[[], object] = bool,
+    first: Callable[[], object] = lambda: None,
 ) -> tuple[str, ...]:
     """Change limits of a dataflow, or of its next start if it does not run; return warnings.
 

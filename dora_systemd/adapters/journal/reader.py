@@ -238,7 +238,7 @@ def read_when_written(read: Callable[[], T], is_behind: Callable[[T], bool]) -> 
 
 
 def _lines(
-    arguments: Sequence[str], bounds: Bounds, cut: Callable[[], object] = bool
+    arguments: Sequence[str], bounds: Bounds, cut: Callable[[], object] = lambda: None
 ) -> Iterator[bytes]:
     """The lines that journalctl prints, within limits. Raises DoraSystemdError for its error.
 
