@@ -185,6 +185,11 @@ def user_name(uid: int, nameless: str = "uid ") -> str:
         return f"{nameless}{uid}"
 
 
+def other_user(uid: int) -> str:
+    """The name of a user who is neither root nor the caller, "" for these two."""
+    return "" if uid in (0, os.geteuid()) else user_name(uid)
+
+
 class _Walk:
     """A walk from the root directory, with one descriptor however long the path is."""
 

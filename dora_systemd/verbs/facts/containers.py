@@ -3,7 +3,6 @@
 Nothing is asked of podman or docker: a socket of theirs is its owner's, and as good as root.
 """
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -31,7 +30,7 @@ from dora_systemd.decisions.resources.containers import (
 from dora_systemd.decisions.resources.usage import WHOLE_CELL
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.trust.paths import user_name
+from dora_systemd.trust.paths import other_user
 
 _MOST_GROUPS = 10_000
 
@@ -69,8 +68,7 @@ def _of_monitor(
     place = f"/{own.relative_to(cgroup.mount_point())}"
     pids = children.get(client.pid, ())
     inner = next((group for pid in pids if (group := process_group(pid, proc))), "")
-    user = "" if client.uid in (0, os.geteuid()) else user_name(client.uid)
-    return container_of(client, inner, place)._replace(user=user)
+    return container_of(client, inner, place)._replace(user=other_user(client.uid))
 
 
 def _add_of_daemons(

@@ -20,7 +20,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode, bad_input
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
-from dora_systemd.trust.paths import Place, exists, reached, user_name
+from dora_systemd.trust.paths import Place, exists, other_user, reached
 from dora_systemd.trust.programs import Account
 from dora_systemd.trust.project import opened_project
 from dora_systemd.values import format_rounded_size, shown
@@ -173,8 +173,7 @@ def _reader(sender: Sender) -> Account | None:
 
 def _foreign_owner(sender: Sender) -> str:
     """Return the owner of the dataflow file, "" for root and the caller, whom the host trusts."""
-    uid = sender.place.uid
-    return "" if uid in (0, os.geteuid()) else user_name(uid)
+    return other_user(sender.place.uid)
 
 
 def _owners(reader: Account | None) -> list[int]:
