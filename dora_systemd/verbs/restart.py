@@ -3,18 +3,20 @@
 act_on() does that for the views, which also stop dataflows.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer, StageObserver, tell_stage
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.runner_socket.client import ask_refusal
 from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.decisions.views.rows import begin_anew
 from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_absent
-from dora_systemd.values import shell_word, shown
+from dora_systemd.values import shown
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.containers import find_outside, with_left
 from dora_systemd.verbs.facts.enabled import enabled_units
@@ -67,10 +69,7 @@ def find_refusals(
     A runner that does not answer is no reason to leave its dataflow as it is.
     """
     running = [cell for cell in cells if cell.has_begun]
-    others = {cell: _other_version(cell) for cell in running if _is_of_other_version(cell)}
-    lost = {cell: error for cell in running if (error := _lost_credential(manager, cell))}
-    away = {cell: error for cell in running if (error := _lost_program(manager, scope, cell))}
-    others = lost | others | away
+    others = {cell: error for cell in running if (error := _seen_here(manager, scope, cell))}
     asked = [
         (cell, beside(partial(_find_refusal, scope, cell, ask)))
         for cell in running
@@ -79,20 +78,27 @@ def find_refusals(
     return others | {cell: error for cell, answer in asked if (error := answer.result())}
 
 
-def _is_of_other_version(cell: Cell) -> bool:
-    """Whether its runner has options that the installed one would refuse; itself accepts them."""
-    return cell.has_options and bool(cell.options_problem)
+def _seen_here(manager: Manager, scope: Scope, cell: Cell) -> DoraSystemdError | None:
+    """The error of a start that the runner of the dataflow does not know."""
+    facts = manager.read(cell.unit, ["ExecStart", "LoadCredential"])
+    return (
+        _lost_program(manager, scope, cell, facts["ExecStart"])
+        or _other_version(cell)
+        or _lost_credential(cell, facts["LoadCredential"] or ())
+    )
 
 
-def _other_version(cell: Cell) -> DoraSystemdError:
+def _other_version(cell: Cell) -> DoraSystemdError | None:
+    """The error for options that the installed runner would refuse; its own accepts them."""
+    if not (cell.has_options and cell.options_problem):
+        return None
     message = f"cannot restart {cell.name}: another version of dora-systemd has started it"
     hint = f"{cell.name} keeps running; doractl list {cell.name} says how to start this version"
     return bad_input(message, hint)
 
 
-def _lost_credential(manager: Manager, cell: Cell) -> DoraSystemdError | None:
+def _lost_credential(cell: Cell, given: Iterable[tuple[str, str]]) -> DoraSystemdError | None:
     """The error for a credential whose file is not there any more: systemd reads it at a start."""
-    given = manager.read(cell.unit, ["LoadCredential"])["LoadCredential"] or ()
     for name, file in given:
         if file.startswith("/") and is_absent(file):
             message = f"cannot use {shown(file)} as credential {name}: there is no such file"
@@ -100,15 +106,17 @@ def _lost_credential(manager: Manager, cell: Cell) -> DoraSystemdError | None:
     return None
 
 
-def _lost_program(manager: Manager, scope: Scope, cell: Cell) -> DoraSystemdError | None:
+def _lost_program(
+    manager: Manager, scope: Scope, cell: Cell, commands: Sequence[Any]
+) -> DoraSystemdError | None:
     """The error for a Python that is gone, as when doractl was installed in another way since."""
-    program = next((one[0] for one in manager.read(cell.unit, ["ExecStart"])["ExecStart"]), "")
+    program = next((one[0] for one in commands), "")
     if not is_absent(program):
         return None
-    start = f"doractl start {cell.name}"  # of an enabled one, that starts its unit file
-    if cell.unit in enabled_units(manager, scope):
-        start = f"doractl start --enable --name {cell.name} {shell_word(cell.options.dataflow)}"
-    how = "deploy its project again" if cell.release else f"doractl stop {cell.name}, then {start}"
+    how = f"doractl stop {cell.name}, then doractl start {cell.name}"
+    # The name of an enabled one starts its unit file, which has that Python, too.
+    if cell.release or cell.unit in enabled_units(manager, scope):
+        how = begin_anew(cell.name, cell.options.dataflow, cell.release, is_enabled=True)
     message = f"cannot restart {cell.name}: {shown(program)}, which executes it, does not exist"
     return bad_input(message, f"{cell.name} keeps running; instead: {how}")
 

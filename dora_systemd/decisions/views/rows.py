@@ -9,6 +9,14 @@ from dora_systemd.names import release_of
 from dora_systemd.values import SECOND, shell_word
 
 
+def begin_anew(name: str, file: str, release: str, is_enabled: bool, is_up: bool = True) -> str:
+    """The commands after which systemd has a command line of the installed version for it."""
+    if release:
+        return "deploy its project again"
+    start = f"doractl start {'--enable ' * is_enabled}--name {name} {shell_word(file)}"
+    return f"doractl stop {name}, then {start}" if is_up else start
+
+
 class Holder(NamedTuple):
     """A process that inhibits restarts of a dataflow."""
 
@@ -103,10 +111,7 @@ class DataflowRow(NamedTuple):
         """Which other version of dora-systemd runs it, and what to do; "" if none does."""
         if self.options_problem:
             # A restart would start the same command line, which the installed runner refuses.
-            flag = "--enable " if self.enabled else ""
-            todo = f"doractl start {flag}--name {self.name} {shell_word(self.dataflow)}"
-            todo = f"doractl stop {self.name}, then {todo}" if self.is_up else todo
-            todo = "deploy its project again" if self.release else todo
+            todo = begin_anew(self.name, self.dataflow, self.release, self.enabled, self.is_up)
             return f"another version has started it: {self.options_problem}", todo
         if self.runner_version in ("", __version__):
             return "", ""

@@ -4,14 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dora_systemd.adapters.host.unit_files import read_unit_file
-from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.unit.file import program_of, runner_of
 from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.decisions.views.rows import begin_anew
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_absent
-from dora_systemd.values import shell_word
 
 
 def judge_enabled(path: Path, scope: Scope) -> Iterator[Finding]:
@@ -31,15 +30,9 @@ def judge_enabled(path: Path, scope: Scope) -> Iterator[Finding]:
         yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
     elif reason := _hindrance(text):
         found = f"{options.name} cannot start at boot: {reason}"
-        yield Finding("boot", State.WARNING, found, _written_again(options))
-
-
-def _written_again(options: RunnerOptions) -> str:
-    """The commands after which the unit file is one of this doractl."""
-    if release_of(options.dataflow):
-        return "deploy its project again"
-    start = f"doractl start --enable --name {options.name} {shell_word(options.dataflow)}"
-    return f"doractl stop {options.name}, then {start}"
+        release = release_of(options.dataflow)
+        remedy = begin_anew(options.name, options.dataflow, release, is_enabled=True)
+        yield Finding("boot", State.WARNING, found, remedy)
 
 
 def _hindrance(text: str) -> str:
