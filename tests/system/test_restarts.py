@@ -313,7 +313,7 @@ AFTER_FREEZE = ("heartbeat", "failed watchdog", "syncing transport", "close mess
 
 @pytest.mark.warns(*CRASHES, *KILLED, *AFTER_FREEZE)
 def test_a_freeze_does_not_blind_it(cell: Cell, project: Project) -> None:
-    """dora connects anew after it, and forgets who has subscribed to the events of the run."""
+    """After a freeze, dora's daemon connects again, and the coordinator drops all subscribers."""
     cell.start(project.three_nodes(), "--node", "source:restart_policy=on-failure")
     cell.systemctl("freeze")
     time.sleep(FREEZE_SECONDS)  # there is nothing to wait for

@@ -172,8 +172,9 @@ _UNSUBSCRIBED = "all daemons running this dataflow disconnected"
 def ends_subscription(record: LogRecord) -> bool:
     """Whether the coordinator sends no more records after this one.
 
-    It forgets a run, and who has subscribed to it, when it loses its last daemon, as after a freeze
-    of 20 s. The connection stays open. When the daemon is back, the run can be subscribed to again.
+    The coordinator forgets a run and its subscribers when all daemons of the run have disconnected,
+    as after a freeze of 20 s. The connection to the subscriber stays open. When a daemon has
+    connected again, the coordinator accepts a new subscription.
     """
     is_own = record.target == "coordinator" and not record.node
     return is_own and record.message.startswith(_UNSUBSCRIBED)

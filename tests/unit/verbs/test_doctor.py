@@ -283,14 +283,19 @@ def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_
     assert left[1].remedy.endswith("dora-ghost.service/cgroup.kill")
 
 
+def place_with_file(manager: FakeManager, scope: Scope, flow: Path) -> None:
+    """Enable a dataflow whose file exists."""
+    flow.touch()
+    plan = make_plan(scope)
+    options = plan.options._replace(dataflow=str(flow))
+    place(manager, plan._replace(options=options), want_boot=True)
+
+
 def test_an_enabled_dataflow_that_systemd_has_lost(
     manager: FakeManager, scope: Scope, tmp_path: Path
 ) -> None:
-    plan = make_plan(scope)
     flow = tmp_path / "robot.yml"
-    flow.touch()
-    plan = plan._replace(options=plan.options._replace(dataflow=str(flow)))
-    place(manager, plan, want_boot=True)
+    place_with_file(manager, scope, flow)
     (finding,) = found(manager, scope).values()
     assert finding.text == "dora-robot.service is enabled and systemd does not know it"
     assert finding.remedy == "systemctl --system daemon-reload"
@@ -307,11 +312,8 @@ def test_an_enabled_dataflow_whose_python_is_gone(
     manager: FakeManager, scope: Scope, tmp_path: Path
 ) -> None:
     """As after uv tool uninstall and an installation by pipx."""
-    plan = make_plan(scope)
     flow = tmp_path / "my robot.yml"
-    flow.touch()
-    plan = plan._replace(options=plan.options._replace(dataflow=str(flow)))
-    place(manager, plan, want_boot=True)
+    place_with_file(manager, scope, flow)
     (unit,) = manager.etc.glob("systemd/*/dora-robot.service")
     unit.write_text(unit.read_text().replace(sys.executable, "/nowhere/bin/python"))
     finding = found(manager, scope)["boot"]

@@ -38,7 +38,7 @@ def test_a_subscription_and_its_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("is_alive", [True, False])
 def test_a_run_that_dora_has_forgotten_for_a_while(tmp_path: Path, is_alive: bool) -> None:
-    """After a freeze the daemon connects anew, and what it could not report is lost."""
+    """After a freeze the daemon connects again. It does not repeat earlier reports."""
 
     async def work() -> None:
         bench = Bench(tmp_path)
