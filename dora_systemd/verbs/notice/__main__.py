@@ -9,13 +9,16 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.host import notify
-from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.adapters.journal.reader import Bounds, JournalReader
 from dora_systemd.decisions.gateway.place import is_directory_of_user
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import parse_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.notice.dispatch import Dispatcher, read_journal
 from dora_systemd.verbs.notice.send import Sender
+
+# Nobody waits for a notice, and after a boot the dataflows have the processor first.
+_BOUNDS = Bounds(seconds=20.0)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -24,7 +27,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         name = parse_name(arguments[0] if arguments else "")
         scope = Scope(is_user=is_directory_of_user(place), uid=os.getuid())
-        manager, journal = Bus(scope), JournalReader()
+        manager, journal = Bus(scope), JournalReader(_BOUNDS)
         sender = Sender(manager, scope, name, journal, Path(place))
         sender.learn()
         notify.send_ready()  # from now on systemd may unload the dataflow

@@ -7,6 +7,7 @@ until the service is ready. From then on all of it is in Memory.
 
 import json
 import os
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -215,6 +216,9 @@ class Sender:
             from dora_systemd.verbs.bundles.write import Failure, write_after
 
             write_after(self._reach, self._scope, cell, box, Failure(POWER_LOST, {}))
+        elif self._journal.is_cut:
+            text = "<4>cannot find out whether power was lost: the journal was not read in time"
+            print(text, file=sys.stderr)
 
     def _reach(self, scope: Scope) -> Manager:
         return self._manager if scope == self._scope else Bus(scope, for_reading=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.bundles.reader import opened
-from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.adapters.journal.reader import Bounds, JournalReader
 from dora_systemd.decisions.notice.happened import FAILED, Happened
 from dora_systemd.decisions.recorder.record import Record
 from dora_systemd.decisions.recorder.ring import ALIGN
@@ -32,11 +32,12 @@ Robot = Callable[..., Sender]
 def robot(manager: FakeManager, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Robot:
     """Lets robot fail, with settings as texts; the service that sends its notices."""
 
-    def failed(*texts: str, is_user: bool = False) -> Sender:
+    def failed(*texts: str, is_user: bool = False, bounds: Bounds | None = None) -> Sender:
         fail(manager, monkeypatch, tmp_path, with_texts(options(), *texts))
         scope = ScopeIn(is_user, os.getuid(), tmp_path / "run")
         (tmp_path / "place").mkdir()
-        return Sender(manager, scope, "robot", JournalReader(), tmp_path / "place")
+        journal = JournalReader(bounds or Bounds())
+        return Sender(manager, scope, "robot", journal, tmp_path / "place")
 
     return failed
 
@@ -67,6 +68,17 @@ def test_a_dataflow_that_is_stopped_before_its_notice(
     assert sent[0] == "notice-sent"
     assert sent[1].endswith(" failed: node camera: exit code 3")
     assert sent[2] == options().uuid
+
+
+def test_a_journal_that_is_read_too_slowly_after_a_boot(
+    robot: Robot, notes: Notes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The records of the boot before are missing, so nothing is known about the power."""
+    sender = robot("black_box=yes", bounds=Bounds(size=0))
+    sender.learn()
+    sender.write_after_boot(now_us=1)
+    assert capsys.readouterr().err.startswith("<4>cannot find out whether power was lost")
+    assert events(notes) == []
 
 
 def test_another_dataflow_of_that_name_without_the_setting(
