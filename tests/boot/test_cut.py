@@ -7,9 +7,11 @@ from tests.boot.flows import NOTES
 from tests.system.cells import run, wait_for
 
 READY = Path("/run/power-cut")
-# It runs already, and systemd stops it as the first thing of the reboot, with the dataflows: a
-# process that the reboot has to start may come when a slow machine has stopped everything.
+# It runs already, and systemd stops it before the dataflows: a process that the reboot has to
+# start, or that is stopped with them, may come when a slow machine has their end on its disk.
 UNIT = f"""
+[Unit]
+After=dora-begun.service dora-running.service user@1000.service
 [Service]
 ExecStart=/bin/sh -c 'echo 1 >/proc/sys/kernel/sysrq; trap "echo b >/proc/sysrq-trigger" TERM; \\
     touch {READY}; while :; do sleep 1000 & wait; done'

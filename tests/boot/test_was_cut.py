@@ -6,6 +6,8 @@ from tests.boot.flows import doractl
 from tests.boot.test_after import they_are_back
 from tests.system.cells import run, wait_for
 
+UNITS = ("--unit=doranotice@begun", "--unit=dora-begun")
+
 
 def test_it_was_a_power_cut() -> None:
     """After a shutdown the file system has nothing to recover."""
@@ -25,7 +27,11 @@ def test_the_one_with_a_black_box_has_a_bundle() -> None:
         found: list[dict[str, str]] = json.loads(doractl("bundles", "-o", "json"))
         return found
 
-    (row,) = wait_for("the bundle", rows, 240)
+    try:
+        (row,) = wait_for("the bundle", rows, 240)
+    except AssertionError:
+        print(run("journalctl", "--output=short-precise", *UNITS).stdout)
+        raise
     assert (row["name"], row["event"], row["by"]) == ("begun", "power-lost", "doranotice")
     words = "the machine went down while it ran, without a shutdown"
     assert words in doractl("why", "--bundle", row["file"])
