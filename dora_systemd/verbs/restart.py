@@ -6,20 +6,18 @@ act_on() does that for the views, which also stop dataflows.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer, StageObserver, tell_stage
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.runner_socket.client import ask_refusal
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.decisions.views.rows import begin_anew
 from dora_systemd.errors import DoraSystemdError, bad_input
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_absent
 from dora_systemd.values import shown
+from dora_systemd.verbs.facts.boot import lost_program
 from dora_systemd.verbs.facts.cells import Cell, refuse_parts
 from dora_systemd.verbs.facts.containers import find_outside, with_left
-from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.locks import uninhibited
 from dora_systemd.verbs.facts.reason import job_reason, logs_hint, need_failure, runners_refusal
 from dora_systemd.verbs.node import NodeOrder, order_node, socket_of
@@ -82,7 +80,7 @@ def _seen_here(manager: Manager, scope: Scope, cell: Cell) -> DoraSystemdError |
     """The error of a start that the runner of the dataflow does not know."""
     facts = manager.read(cell.unit, ["ExecStart", "LoadCredential"])
     return (
-        _lost_program(manager, scope, cell, facts["ExecStart"])
+        lost_program(manager, scope, cell, facts["ExecStart"], "restart")
         or _other_version(cell)
         or _lost_credential(cell, facts["LoadCredential"] or ())
     )
@@ -104,21 +102,6 @@ def _lost_credential(cell: Cell, given: Iterable[tuple[str, str]]) -> DoraSystem
             message = f"cannot use {shown(file)} as credential {name}: there is no such file"
             return _kept(cell, bad_input(message, "put it back"))
     return None
-
-
-def _lost_program(
-    manager: Manager, scope: Scope, cell: Cell, commands: Sequence[Any]
-) -> DoraSystemdError | None:
-    """The error for a Python that is gone, as when doractl was installed in another way since."""
-    program = next((one[0] for one in commands), "")
-    if not is_absent(program):
-        return None
-    how = f"doractl stop {cell.name}, then doractl start {cell.name}"
-    # The name of an enabled one starts its unit file, which has that Python, too.
-    if cell.release or cell.unit in enabled_units(manager, scope):
-        how = begin_anew(cell.name, cell.options.dataflow, cell.release, is_enabled=True)
-    message = f"cannot restart {cell.name}: {shown(program)}, which executes it, does not exist"
-    return bad_input(message, f"{cell.name} keeps running; instead: {how}")
 
 
 def require_startable(manager: Manager, scope: Scope, cell: Cell, ask: Ask = ask_refusal) -> None:

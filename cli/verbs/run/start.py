@@ -27,6 +27,7 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode, usage_error
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.boot import lost_program
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.start.check import check_plan, check_unit
@@ -191,6 +192,9 @@ def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
     if cell.has_begun:
         details = {"file": file, "is_ready": cell.state.active == "active"}
         return print_outcomes([Outcome(cell, format_up(cell), is_news=False, details=details)])
+    commands = bus.read(cell.unit, ["ExecStart"])["ExecStart"]
+    if error := lost_program(bus, scope, cell, commands, "start"):
+        raise error
     bus.hold(cell.unit)  # keep a failed transient unit
     bus.reset_failed(cell.unit)
     note = logout_note(scope)

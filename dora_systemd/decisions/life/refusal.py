@@ -92,3 +92,7 @@ def setup_failure(status: int) -> str:
         return ""
     name = _NAMES[status - _FIRST]
     return f"{_WORDS.get(name, _OTHER)} (exit code {status}{'' if name == '-' else f'/{name}'})"
+
+
+NOT_EXECUTED = setup_failure(203)
+"""The words for a program that does not exist, or that its user may not execute."""

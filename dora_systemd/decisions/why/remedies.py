@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from dora_systemd.decisions.cell.exits import EARLY, ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.refusal import NOT_EXECUTED
 from dora_systemd.decisions.views.dataflows import FROZEN, WAITING
 from dora_systemd.decisions.watchdog.judge import LATE, TRIGGERED
 from dora_systemd.decisions.why.verdict import Verdict
@@ -75,6 +76,10 @@ _CALL_DORA = (
     "have {node} call Node() and keep running, or take {node} out of {file} (what only prepares "
     "something is no node), then run: doractl restart {name}"
 )
+_NO_PROGRAM = (
+    "systemctl {flag} status {unit} names its program; if that is gone, doractl start {name} says "
+    "how to start it again"
+)
 _GATHERING = "nothing: it starts when all machines are there; doractl stop {name} gives up"
 
 
@@ -92,7 +97,8 @@ def remedy_of(verdict: Verdict) -> str:
         return _CALL_DORA
     if verdict.cause is Cause.NODE_FAILED and exit.kind is ExitKind.SIGNAL:
         return _SIGNAL_REMEDIES.get(exit.number, _REMEDIES[verdict.cause])
-    remedy = _REMEDIES.get(verdict.cause, "")
+    is_lost = verdict.summary == NOT_EXECUTED
+    remedy = _NO_PROGRAM if is_lost else _REMEDIES.get(verdict.cause, "")
     if verdict.cause is Cause.NODE_WATCHDOG:
         found = (text for reason, text in _WATCHDOG_REMEDIES.items() if reason in verdict.summary)
         remedy = next(found, remedy)

@@ -1,11 +1,13 @@
 """doractl restart: what could not start again keeps running, and a failure is reported."""
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.facts.boot import lost_program
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import failure_reason
 from dora_systemd.verbs.restart import Ask, require_startable, restart_cells
@@ -92,6 +94,29 @@ def test_a_dataflow_whose_python_is_gone_keeps_running(
     assert not any(call[0] == "RestartUnit" and len(call) > 1 for call in manager.calls)
     (forced,) = restart_cells(manager, SCOPE, read_cells(manager), BY, True, ask=accept)
     assert forced.text == f"Dataflow restarted: {UUID} (robot)"
+
+
+@pytest.mark.parametrize(
+    ("is_enabled", "how"),
+    [
+        (False, "doractl stop robot, then doractl start robot"),
+        (True, "doractl start --enable --name robot /srv/robot.yml"),
+    ],
+)
+def test_a_failed_dataflow_whose_python_is_gone(
+    manager: FakeManager, is_enabled: bool, how: str, tmp_path: Path
+) -> None:
+    """A start of its unit would fail as the last one."""
+    manager.etc, manager.kind = tmp_path, SCOPE.word
+    if is_enabled:
+        manager.enable_unit_files([UNIT])
+    manager.units[UNIT]["ActiveState"] = "failed"
+    (cell,) = read_cells(manager)
+    assert lost_program(manager, SCOPE, cell, [(sys.executable, [])], "start") is None
+    error = lost_program(manager, SCOPE, cell, [("/nowhere/bin/python", [])], "start")
+    assert error is not None
+    message = "cannot start robot: /nowhere/bin/python, which executes it, does not exist"
+    assert (error.message, error.hint, error.code) == (message, how, ExitCode.BAD_INPUT)
 
 
 def test_restart_that_the_runner_refuses(manager: FakeManager) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.refusal import NOT_EXECUTED
 from dora_systemd.decisions.logs.journal_events import ROLLED_BACK as BACK_EVENT
 from dora_systemd.decisions.releases.past import FAILED, ROLLED_BACK, Switch
 from dora_systemd.decisions.resources.rivals import Rival
@@ -358,6 +359,13 @@ AWAY = "camera stays down until doractl restart robot; the other nodes keep runn
             [
                 "systemctl --system status dora-robot.service shows what systemd did",
                 "systemd has stopped restarting it; doractl restart robot resets the counter",
+            ],
+        ),
+        (
+            replace(VERDICT, cause=Cause.UNIT_FAILED, summary=NOT_EXECUTED),
+            [
+                "systemctl --system status dora-robot.service names its program; if that is gone, "
+                "doractl start robot says how to start it again",
             ],
         ),
         (
