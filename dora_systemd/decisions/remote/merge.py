@@ -102,8 +102,14 @@ class Records:
 
     def __init__(self) -> None:
         self._pending = 0
+        self._has_data = self._has_record = False
         self._reader = ExportReader()
         self._lines = Lines()
+
+    @property
+    def is_none(self) -> bool:
+        """Whether there was output, and no record in it."""
+        return self._has_data and not self._has_record
 
     @property
     def is_too_much(self) -> bool:
@@ -114,14 +120,18 @@ class Records:
         """The records that `data` completes, in the export format, with times that can be."""
         found = self._reader.feed(data)
         self._pending = 0 if found else self._pending + len(data)
+        self._has_data |= bool(data)
+        self._has_record |= bool(found)
         for record in found:
             record[TIME] = b"%d" % time_of(record.get(TIME))
         return found
 
     def objects(self, data: bytes) -> Iterator[dict[str, Any]]:
         """The objects that `data` completes, of -o json."""
+        self._has_data |= bool(data)
         for line in self._lines.feed(data):
             if isinstance(value := read_json(line), dict):
+                self._has_record = True
                 yield value
 
 

@@ -134,7 +134,9 @@ def test_what_was_read_can_be_printed(capsys: Printed) -> None:
 
 def test_an_answer_that_is_none(capsys: Printed) -> None:
     make_program(Path(os.environ["PATH"].partition(":")[0]) / "doractl", "echo garbage")
-    for words in (["list"], ["list", "-o", "json"], ["stop", "-a", "-o", "json"]):
+    listed, logs = ["list"], ["logs", "robot"]
+    tables = [*listed, "-o", "json"], [*logs, "-o", "json"], ["stop", "-a", "-o", "json"]
+    for words in (listed, logs, *tables):
         assert main.run([*words, "-H", "h1,h2"]) == ExitCode.NO_HOST
         err = capsys.readouterr().err
         assert err.count("cannot read the answer of h") == 2
@@ -260,7 +262,8 @@ def test_nothing_of_it_is_loaded_without_a_host() -> None:
 def test_a_doractl_that_hangs_there(capsys: Printed, monkeypatch: pytest.MonkeyPatch) -> None:
     """It holds back neither the rows of the others nor, for ever, their lines."""
     place = Path(os.environ["PATH"].partition(":")[0])
-    make_program(place / "doractl", '[ "$HOST" = h1 ] && exec sleep 1000\necho "[]"')
+    answer = 'case "$*" in *logs*) ;; *) echo "[]";; esac'
+    make_program(place / "doractl", f'[ "$HOST" = h1 ] && exec sleep 1000\n{answer}')
     monkeypatch.setattr("dora_systemd.cli.remote.plan.SHORT_SECONDS", 0.5)
     monkeypatch.setattr("dora_systemd.cli.remote.plan.ANSWER_SECONDS", 0.5)
     for words in (["list"], ["logs", "robot"], ["releases"]):
