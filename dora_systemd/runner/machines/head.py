@@ -92,9 +92,9 @@ class Head(Shared):
 
     async def _refuse(self, request: Request, ends: Ends) -> None:
         del request
-        name = self.options.name
-        message = f"cannot reload {name}: it runs on several machines"
-        await refuse(ends, DoraSystemdError(message, f"run: doractl restart {name}"))
+        message = f"cannot reload {self.options.name}: it runs on several machines"
+        hint = f"doractl restart {self.options.name} starts the changed files"
+        await refuse(ends, DoraSystemdError(message, hint))
 
     def check(self, dataflow: Dataflow) -> None:
         """Raise DoraSystemdError for a node that cannot run on its machine."""
