@@ -37,6 +37,10 @@ class RingFile:
         """Bytes of memory that the ring takes."""
         return os.fstat(self._fd).st_blocks * 512
 
+    def again(self) -> "RingFile":
+        """The same file, which is closed by itself."""
+        return RingFile(os.dup(self._fd), self.header)
+
     def close(self) -> None:
         """Close the file, once."""
         if self._is_open:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import restart_of
@@ -21,7 +22,8 @@ from dora_systemd.decisions.logs.journal_events import GIVEN_UP
 from dora_systemd.paths import LAST_REQUEST, request_file
 from dora_systemd.runner.cell.failure import say
 
-_HAND_OVER_SECONDS = 10.0
+_HAND_OVER_SECONDS = 20.0
+"""Less than WatchdogSec=. The service starts with the least share of the processor."""
 _POLL_SECONDS = 0.05
 
 
@@ -54,6 +56,7 @@ def hand_over_ring(options: RunnerOptions, end: RunnerExit | None) -> None:
     is_final = end in (RunnerExit.NODES_FAILED, RunnerExit.RESTARTS_SPENT)
     is_final |= restart_of(options).policy == "no" and end not in (None, RunnerExit.OK)
     if is_final and (file := request_file(os.environ)):
+        notify.send_alive()
         await_removal(file.with_name(LAST_REQUEST), _HAND_OVER_SECONDS)
 
 

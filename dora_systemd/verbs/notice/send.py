@@ -10,7 +10,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -139,9 +139,9 @@ class Memory:
             self._ring = ring
 
     def ring_of(self, uuid: str) -> RingFile | None:
-        """The ring of the dataflow with that UUID, if there is one."""
+        """The ring of the dataflow with that UUID, if there is one, for one reader."""
         ring = self._ring
-        return ring if ring and ring.header.facts.get("uuid") == uuid else None
+        return ring.again() if ring and ring.header.facts.get("uuid") == uuid else None
 
     def close_ring(self) -> None:
         """Give back the memory of a recorder that systemd has closed meanwhile."""
@@ -177,7 +177,8 @@ class Sender:
         if noticed.box:
             details = {"until": str(happened[0].mono_us), "pause": str(pause_us)}
             self._write_bundle(noticed.cell, noticed.box, main, details)
-            self._memory.close_ring()
+            if main.what == FAILED:  # a node that is given up may be followed by that
+                self._memory.close_ring()
         if not noticed.cell.options.has("on_failure"):
             return None
         node = self._write_report(noticed.cell, happened)
@@ -202,8 +203,10 @@ class Sender:
         from dora_systemd.verbs.bundles.write import Failure, write_after
 
         about = main if main.what in (FAILED, GIVEN_UP) else None
-        failure = Failure(main.what, details, self._memory.ring_of(cell.uuid), about)
-        write_after(self._reach, self._scope, cell, box, failure)
+        ring = self._memory.ring_of(cell.uuid)
+        with closing(ring) if ring else nullcontext():
+            failure = Failure(main.what, details, ring, about)
+            write_after(self._reach, self._scope, cell, box, failure)
 
     def write_after_boot(self, now_us: int) -> None:
         """Write a bundle of the life that a power cut has ended. now_us: CLOCK_BOOTTIME."""

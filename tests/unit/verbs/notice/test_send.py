@@ -8,6 +8,7 @@ import pytest
 
 from dora_systemd.adapters.bundles.reader import opened
 from dora_systemd.adapters.journal.reader import Bounds, JournalReader
+from dora_systemd.decisions.logs.journal_events import GIVEN_UP
 from dora_systemd.decisions.notice.happened import FAILED, Happened
 from dora_systemd.decisions.recorder.record import Record
 from dora_systemd.decisions.recorder.ring import ALIGN
@@ -146,20 +147,27 @@ def test_why_there_is_no_notice(
 
 
 def test_the_last_messages_are_those_at_the_failure(
-    robot: Robot, manager: FakeManager, tmp_path: Path
+    robot: Robot, manager: FakeManager, notes: Notes
 ) -> None:
-    """systemd gives the memory of a recorder back when the dataflow is stopped or started again."""
-    sender = robot("black_box=yes", "record=yes", is_user=True)
+    """systemd gives the memory of a recorder back when the dataflow is stopped or started again.
+
+    Before systemd 254 also when it has failed, while the bundle of the node is written.
+    """
+    sender = robot("black_box=keep=5,size=20M", "record=yes", is_user=True)
     ring = fitted_ring(-1, header_of(Record(), ["camera/image"], {"uuid": options().uuid}))
     Writer(FileStore(ring, ALIGN), PAGE).put(0, message(BATCH, 5, SCHEMA))
     manager.units[UNIT]["MainPID"] = os.getpid()
     sender.learn()
     manager.units[UNIT]["MainPID"] = 0
     os.close(ring)
-    sender.send(HAPPENED, 15)
-    (row,) = read_bundles(ScopeIn(True, os.getuid(), tmp_path / "run"), ["robot"])
-    with opened(Path(row.file)) as bundle:
-        assert "recording.mcap" in [one.name for one in bundle.manifest.parts]
-        assert BATCH in bundle.read("recording.mcap")
+    for what in (GIVEN_UP, FAILED):
+        sender.send([HAPPENED[0]._replace(what=what)], 15)
+        file = Path(notes.found("DORA_FILE")[-1][0])
+        with opened(file) as bundle:
+            assert bundle.manifest.event == what
+            assert "recording.mcap" in [one.name for one in bundle.manifest.parts]
+            assert BATCH in bundle.read("recording.mcap")
+        file.unlink()  # the next one would be too soon after it
+        sender.learn()
     left = [str(one.readlink()) for one in Path("/proc/self/fd").iterdir() if one.exists()]
     assert not [one for one in left if "dora-ring" in one], "its memory is free"
