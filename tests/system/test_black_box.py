@@ -73,7 +73,9 @@ def test_a_storm_of_failures(cell: Cell, project: Project, bundles: Path) -> Non
     # In few rounds, whatever else this machine does slows a restart down more than a bundle.
     assert ROUNDS < 10 or with_box < 1.5 * without, seconds
     assert journalctl(*refused)
-    assert len([*bundles.glob("*.tar")]) == 1
+    # On a slow machine one of the kills may come when nodes end already, which is another cause.
+    rows = json.loads(cell.doractl("bundles", cell.name, "-o", "json").stdout)
+    assert 1 <= len({(one["node"], one["cause"]) for one in rows}) == len(rows) <= 2
     assert sum(one.stat().st_size for one in bundles.iterdir()) < 4 << 20
 
 

@@ -44,6 +44,7 @@ TOLERATED = (
     Word("Route data with unknown scope", _ORDER),
     Word("[Gossip] Received LinkStateList from unknown link", _ORDER),
     Word("Attempt to establish transport to itself", _ORDER),
+    Word("no heartbeat message from machine", _SLOW),  # for 15 s, by the coordinator
     Word("zenoh teardown timed out", _SLOW),
     Word("Discarding event for input", _SLOW),
     Word("ms for handling event", _SLOW),
