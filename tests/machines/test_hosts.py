@@ -7,6 +7,8 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 
 import pytest
 
@@ -80,16 +82,21 @@ def test_a_cable_pulled_in_the_middle_of_the_logs(how: str) -> None:
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as child:
         assert child.stdout
         assert child.stderr
+        # Always read: doractl waits for whoever leaves its lines in the pipe, and reports no loss.
+        lines = SimpleQueue[str]()
+        reader = Thread(target=lambda out: [*map(lines.put, out)], args=(child.stdout,))
+        reader.start()
         seen = set[str]()
         while seen != set(OTHERS):
-            seen.add(child.stdout.readline().split()[0])
+            seen.add(lines.get().split()[0])
         with cable("b", how):
             assert child.stderr.readline().startswith("doractl: ")
-            line = child.stdout.readline()
-            while not line.startswith("c"):
-                line = child.stdout.readline()
+            while not lines.empty():
+                lines.get()
+            while not lines.get().startswith("c"):
+                pass
         child.terminate()
-        child.communicate()
+        reader.join()
     wait_for("nobody follows on c", lambda: there("c", "pgrep", "-f", "doractl logs").returncode)
 
 
