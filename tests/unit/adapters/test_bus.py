@@ -14,6 +14,7 @@ from dora_systemd.adapters.bus import systemd as bus
 from dora_systemd.adapters.bus.connection import decoded, encoded
 from dora_systemd.adapters.bus.manager import Observer
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_readable
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import fake_systemd
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
@@ -67,14 +68,14 @@ def test_a_struct_of_the_wrong_length_is_a_mistake_of_ours() -> None:
         encoded("(ss)", ("a",))
 
 
-@pytest.mark.parametrize("text", ["a\0b", "\udcff", "\0"])
+@pytest.mark.parametrize("text", ["a\0b", "\udcff", "\0", "\ufdd0", "\uffff"])
 def test_what_is_no_text_for_d_bus(text: str) -> None:
     with pytest.raises(DoraSystemdError) as caught:
         encoded("s", text)
     assert caught.value.code is ExitCode.USAGE
 
 
-@given(st.lists(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))))
+@given(st.lists(st.text().filter(is_readable)))
 def test_text_survives_the_way_there_and_back(texts: list[str]) -> None:
     sent = [value for kind, value in encoded("as", texts) if kind == ord("s")]
     assert decoded(sent) == texts
