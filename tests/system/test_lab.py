@@ -25,6 +25,7 @@ def run(*command: str) -> subprocess.CompletedProcess[str]:
 
 def test_systemd_is_the_first_process() -> None:
     assert Path("/proc/1/comm").read_text() == "systemd\n"
+    assert run("systemctl", "--failed", "--plain", "--no-legend").stdout == ""
     assert run("systemctl", "is-system-running").stdout == "running\n"
 
 
