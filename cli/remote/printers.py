@@ -287,7 +287,7 @@ class LogPrinter:
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
         """Expect no more records of this host."""
         self.merge.end(host.text)
-        return invalid(host) if error is None and self._records[host].is_none else None
+        return invalid(host) if error is None and self._records[host].is_unreadable else None
 
     def look(self, is_complete: bool) -> None:
         """Print what is due. is_complete: every host was reached or given up."""

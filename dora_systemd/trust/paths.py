@@ -186,7 +186,7 @@ def user_name(uid: int, nameless: str = "uid ") -> str:
 
 
 def other_user(uid: int) -> str:
-    """The name of a user who is neither root nor the caller, "" for these two."""
+    """Return the name of the user `uid`; "" if that is root or the caller."""
     return "" if uid in (0, os.geteuid()) else user_name(uid)
 
 

@@ -38,7 +38,7 @@ class RingFile:
         return os.fstat(self._fd).st_blocks * 512
 
     def again(self) -> "RingFile":
-        """The same file, which is closed by itself."""
+        """Open the same file once more; each of the two is closed by itself."""
         return RingFile(os.dup(self._fd), self.header)
 
     def close(self) -> None:

@@ -31,7 +31,7 @@ TRANSCRIPTS = "tests/system/transcripts"
 TYPED = [f"{TRANSCRIPTS}/test_transcripts.py::test_task[{one}]" for one in ("first-start", "typo")]
 # System tests that need no image or kernel of their own.
 IN_CONTAINER = "not vm and not emulator and not openarm"
-# Containers at the same time. Most of the time of a test is waiting.
+# Containers at the same time. Most of the time of a test is waiting: three leave processors idle.
 CONTAINERS = 4
 # A step that takes so many times longer than it should hangs: it fails, and the others are shown.
 # A machine may have half of the speed, and images are built in the minutes of the first that asks.

@@ -82,7 +82,7 @@ def test_a_cable_pulled_in_the_middle_of_the_logs(how: str) -> None:
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as child:
         assert child.stdout
         assert child.stderr
-        # Always read: doractl waits for whoever leaves its lines in the pipe, and reports no loss.
+        # A thread reads all lines: with a full pipe doractl blocks, and cannot report the loss.
         lines = SimpleQueue[str]()
         reader = Thread(target=lambda out: [*map(lines.put, out)], args=(child.stdout,))
         reader.start()

@@ -114,7 +114,6 @@ def test_the_folders_and_their_tests_are_there() -> None:
     for folder in FOLDERS:
         assert (CHECKOUT / "dora_systemd" / folder).is_dir()
         assert (CHECKOUT / "tests/unit" / folder).is_dir()
-
     # What a child process runs is a program of its own.
     modules = (CHECKOUT / "dora_systemd/trust").glob("*.py")
     programs = {f"trust/{one.name}" for one in modules if "__main__" in one.read_text()}

@@ -107,7 +107,7 @@ class Records:
         self._lines = Lines()
 
     @property
-    def is_none(self) -> bool:
+    def is_unreadable(self) -> bool:
         """Whether there was output, and no record in it."""
         return self._has_data and not self._has_record
 

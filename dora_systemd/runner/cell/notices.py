@@ -23,7 +23,7 @@ from dora_systemd.paths import LAST_REQUEST, request_file
 from dora_systemd.runner.cell.failure import say
 
 _HAND_OVER_SECONDS = 20.0
-"""Less than WatchdogSec=. The service starts with the least share of the processor."""
+"""Less than WatchdogSec=. The service that opens the ring has the least share of the processor."""
 _POLL_SECONDS = 0.05
 
 

@@ -177,7 +177,7 @@ class Sender:
         if noticed.box:
             details = {"until": str(happened[0].mono_us), "pause": str(pause_us)}
             self._write_bundle(noticed.cell, noticed.box, main, details)
-            if main.what == FAILED:  # a node that is given up may be followed by that
+            if main.what == FAILED:  # this may still follow when a node was given up
                 self._memory.close_ring()
         if not noticed.cell.options.has("on_failure"):
             return None
@@ -220,7 +220,7 @@ class Sender:
 
             write_after(self._reach, self._scope, cell, box, Failure(POWER_LOST, {}))
         elif self._journal.is_cut:
-            text = "<4>cannot find out whether power was lost: the journal was not read in time"
+            text = "<4>cannot find out whether power was lost: the journal was read only in part"
             print(text, file=sys.stderr)
 
     def _reach(self, scope: Scope) -> Manager:

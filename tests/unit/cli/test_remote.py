@@ -134,10 +134,8 @@ def test_what_was_read_can_be_printed(capsys: Printed) -> None:
 
 def test_an_answer_that_is_none(capsys: Printed) -> None:
     make_program(Path(os.environ["PATH"].partition(":")[0]) / "doractl", "echo garbage")
-    listed, logs = ["list"], ["logs", "robot"]
-    tables = [*listed, "-o", "json"], [*logs, "-o", "json"], ["stop", "-a", "-o", "json"]
-    for words in (listed, logs, *tables):
-        assert main.run([*words, "-H", "h1,h2"]) == ExitCode.NO_HOST
+    for line in ("list", "list -o json", "stop -a -o json", "logs robot", "logs robot -o json"):
+        assert main.run([*line.split(), "-H", "h1,h2"]) == ExitCode.NO_HOST
         err = capsys.readouterr().err
         assert err.count("cannot read the answer of h") == 2
         assert "Traceback" not in err
