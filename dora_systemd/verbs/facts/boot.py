@@ -60,8 +60,8 @@ def lost_program(
         return None
     how = f"doractl stop {cell.name}, then doractl start {cell.name}"
     # The name of an enabled one starts its unit file, which has that Python, too.
-    if cell.release or cell.unit in enabled_units(manager, scope):
-        how = begin_anew(cell.name, cell.options.dataflow, cell.release, True, cell.has_begun)
+    if (is_enabled := cell.unit in enabled_units(manager, scope)) or cell.release:
+        how = begin_anew(cell.name, cell.options.dataflow, cell.release, is_enabled, cell.has_begun)
     kept = f"{cell.name} keeps running; instead: " if cell.has_begun else ""
     message = f"cannot {verb} {cell.name}: {shown(program)}, which executes it, does not exist"
     return bad_input(message, f"{kept}{how}")
